@@ -1,0 +1,186 @@
+"""Exact inference with dense covariance matrices, formed in row blocks (DESIGN §8).
+
+Plain autograd keeps every intermediate n × n matrix of the kernel. Here the covariance is filled block
+by block without a graph, and the backward pass forms each block again, with one, to contract it with
+∂ log p/∂K; only the lower triangle is ever formed. Memory is a few n × n matrices whatever the kernel.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from gpytorch.kernels import Kernel
+from torch import Tensor
+
+from bayes_impedance.errors import NotPositiveDefiniteError, TooManySamplesError
+from bayes_impedance.kernels.warped import evaluate
+
+#: Entries of a block: large enough to hide the cost of a call, small enough to stay in the cache.
+BLOCK_ENTRIES = 2**17
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What the dense engine conditions on.
+
+    `inputs` `(*batch, n, D)`; `residual` u − E[u] `(*batch, n)` [N]; `noise_variance` σ_r² `(*batch, 1)`
+    [N²]; `valid` `(*batch, n)` is False where a sample only pads a batch of groups of unequal length.
+    """
+
+    inputs: Tensor
+    residual: Tensor
+    noise_variance: Tensor
+    valid: Tensor | None = None
+
+
+def log_marginal_likelihood(kernel: Kernel, observations: Observations, jitter: float = 0.0) -> Tensor:
+    """log N(u; E[u], K + σ_r² I), `(*batch,)` [nats], differentiable in kernel, residual and noise.
+
+    `jitter` is added to the diagonal relative to the mean prior variance.
+
+    Raises:
+        NotPositiveDefiniteError: no Cholesky factor at this jitter.
+    """
+    parameters = [p for p in kernel.parameters() if p.requires_grad]
+    return _LogMarginalLikelihood.apply(
+        kernel, observations, jitter, observations.residual, observations.noise_variance, *parameters
+    )
+
+
+class Factor:
+    """Cholesky factor L of K + σ_r² I and α = (K + σ_r² I)⁻¹ (u − E[u]), computed once and kept.
+
+    Raises:
+        NotPositiveDefiniteError: no Cholesky factor at this jitter.
+    """
+
+    def __init__(self, kernel: Kernel, observations: Observations, jitter: float = 0.0) -> None:
+        with torch.no_grad():
+            self.cholesky = _cholesky(kernel, observations, jitter)
+            residual = _masked(observations.residual, observations.valid)
+            self.alpha = torch.cholesky_solve(residual.unsqueeze(-1), self.cholesky).squeeze(-1)
+
+    def condition(self, cross: Tensor, prior_variance: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean shift and variance of variables with covariance `cross` `(*batch, n, m)` to the force.
+
+        Returns Σᵀα and prior − diag(Σᵀ (K+σ_r²I)⁻¹ Σ), each `(*batch, m)`.
+        """
+        shift = (cross.mT @ self.alpha.unsqueeze(-1)).squeeze(-1)
+        half = torch.linalg.solve_triangular(self.cholesky, cross, upper=False)
+        # Rounding can push a variance of a fully determined variable just below zero.
+        return shift, (prior_variance - half.square().sum(-2)).clamp_min(0.0)
+
+
+def check_capacity(n: int, limit: int, where: str) -> None:
+    """Refuse more samples than the engine may hold, with what they would cost.
+
+    Raises:
+        TooManySamplesError: n > limit.
+    """
+    if n > limit:
+        gigabytes = 4 * 8 * n**2 / 1e9
+        seconds = 2e-10 * n**3 * 2
+        raise TooManySamplesError(
+            f"{where}: expected at most engine.max_samples = {limit} samples in a group for the dense engine, "
+            f"got {n}, which would need about {gigabytes:.1f} GB and {seconds:.0f} s an evaluation; "
+            f"set preprocessing.rate to thin the log, cut it with log.window, or raise engine.max_samples"
+        )
+
+
+class _LogMarginalLikelihood(torch.autograd.Function):
+    """log p and its gradient; the gradient of K is contracted block by block."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, kernel: Kernel, observations: Observations, jitter: float,
+        residual: Tensor, noise_variance: Tensor, *parameters: Tensor,
+    ) -> Tensor:  # fmt: skip
+        valid = observations.valid
+        cholesky = _cholesky(kernel, observations, jitter)
+        masked = _masked(residual, valid)
+        alpha = torch.cholesky_solve(masked.unsqueeze(-1), cholesky).squeeze(-1)
+        count = residual.shape[-1] if valid is None else valid.sum(-1)
+        log_det = 2.0 * cholesky.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        ctx.kernel, ctx.observations = kernel, observations
+        ctx.save_for_backward(cholesky, alpha)
+        return -0.5 * ((masked * alpha).sum(-1) + log_det + count * math.log(2.0 * math.pi))
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
+        kernel, observations = ctx.kernel, ctx.observations
+        cholesky, alpha = ctx.saved_tensors
+        valid = observations.valid
+        # ∂ log p/∂K = ½ (α αᵀ − K⁻¹)
+        weight = torch.cholesky_inverse(cholesky).neg_()
+        weight.addcmul_(alpha.unsqueeze(-1), alpha.unsqueeze(-2)).mul_(0.5 * grad[..., None, None])
+        diagonal = weight.diagonal(dim1=-2, dim2=-1)
+        noise_gradient = _masked(diagonal, valid).sum(-1, keepdim=True)
+        noise_gradient = _sum_to(noise_gradient, observations.noise_variance.shape)
+        residual_gradient = _sum_to(_masked(-alpha, valid) * grad.unsqueeze(-1), observations.residual.shape)
+
+        parameters = [p for p in kernel.parameters() if p.requires_grad]
+        gradients = [torch.zeros_like(p) for p in parameters]
+        for start, stop in _blocks(observations.inputs):
+            block_weight = _masked_block(weight[..., start:stop, :stop], valid, start, stop)
+            # Below the diagonal each entry stands for itself and for its mirror image.
+            block_weight[..., :start].mul_(2.0)
+            with torch.enable_grad():
+                block = _block(kernel, observations.inputs, start, stop)
+                parts = torch.autograd.grad(block, parameters, block_weight.expand_as(block), allow_unused=True)
+            for total, part in zip(gradients, parts, strict=True):
+                if part is not None:
+                    total.add_(part)
+        return (None, None, None, residual_gradient, noise_gradient, *gradients)
+
+
+def _cholesky(kernel: Kernel, observations: Observations, jitter: float) -> Tensor:
+    inputs, valid = observations.inputs, observations.valid
+    n = inputs.shape[-2]
+    batch = torch.broadcast_shapes(inputs.shape[:-2], kernel.batch_shape, observations.residual.shape[:-1])
+    covariance = inputs.new_zeros(*batch, n, n)
+    for start, stop in _blocks(inputs):
+        block = _block(kernel, inputs, start, stop)
+        covariance[..., start:stop, :stop] = _masked_block(block, valid, start, stop)
+    diagonal = covariance.diagonal(dim1=-2, dim2=-1)
+    added = jitter * diagonal.mean(-1, keepdim=True) + observations.noise_variance
+    diagonal.add_(added if valid is None else torch.where(valid, added, 1.0))
+    cholesky, info = torch.linalg.cholesky_ex(covariance)
+    if bool(info.any()):
+        row = int(info.max())
+        raise NotPositiveDefiniteError(
+            f"the covariance of {n} forces is not positive definite at row {row} with jitter {jitter:g} of the "
+            "mean prior variance; raise engine.jitter tenfold, or model.noise_sd, or thin the log with "
+            "preprocessing.rate"
+        )
+    return cholesky
+
+
+def _block(kernel: Kernel, inputs: Tensor, start: int, stop: int) -> Tensor:
+    return evaluate(kernel, inputs[..., start:stop, :], inputs[..., :stop, :])
+
+
+def _blocks(inputs: Tensor) -> Iterator[tuple[int, int]]:
+    n = inputs.shape[-2]
+    rows = max(16, BLOCK_ENTRIES // max(1, n * math.prod(inputs.shape[:-2])))
+    for start in range(0, n, rows):
+        yield start, min(start + rows, n)
+
+
+def _masked(values: Tensor, valid: Tensor | None) -> Tensor:
+    return values if valid is None else values * valid
+
+
+def _masked_block(block: Tensor, valid: Tensor | None, start: int, stop: int) -> Tensor:
+    """The block with the rows and columns of padding at zero; always a copy that may be written to."""
+    if valid is None:
+        return block.clone() if block.requires_grad is False else block
+    return block * valid[..., start:stop, None] * valid[..., None, :stop]
+
+
+def _sum_to(values: Tensor, shape: torch.Size) -> Tensor:
+    """Sum over the dimensions along which `shape` was broadcast."""
+    return values.sum_to_size(shape) if values.shape != shape else values

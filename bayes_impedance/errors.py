@@ -1,0 +1,33 @@
+"""Errors a user can mend: each message says what was expected, what was found, where, and what to do."""
+
+
+class BayesImpedanceError(Exception):
+    """Base of every error that input, configuration or files can cause; the command line exits with 2."""
+
+
+class ConfigurationError(BayesImpedanceError):
+    """A configuration is malformed, or asks for something that the data cannot give."""
+
+
+class LogError(BayesImpedanceError):
+    """A recording cannot be read, or what it holds is not a valid interaction log."""
+
+
+class ModelFolderError(BayesImpedanceError):
+    """A model folder is missing, truncated, changed, or written by a newer schema."""
+
+
+class NotPositiveDefiniteError(BayesImpedanceError):
+    """A covariance matrix has no Cholesky factor at the jitter that was tried."""
+
+
+class TooManySamplesError(BayesImpedanceError):
+    """More samples than the engine is allowed to hold."""
+
+
+class OutputError(BayesImpedanceError):
+    """An output file or folder cannot be written."""
+
+
+class LogWarning(UserWarning):
+    """The recording can be used, but something in it looks wrong."""

@@ -1,0 +1,10 @@
+"""Covariances of the interaction force, as ordinary gpytorch kernels."""
+
+from bayes_impedance.kernels.impedance import ImpedanceKernel as ImpedanceKernel
+from bayes_impedance.kernels.impedance import InputLayout as InputLayout
+from bayes_impedance.kernels.impedance import InteractionKernel as InteractionKernel
+from bayes_impedance.kernels.impedance import InteractionMean as InteractionMean
+from bayes_impedance.kernels.impedance import Latent as Latent
+from bayes_impedance.kernels.impedance import PDKernel as PDKernel
+from bayes_impedance.kernels.stationary import StationaryKernel as StationaryKernel
+from bayes_impedance.kernels.warped import ImpedanceProcess as ImpedanceProcess
