@@ -62,17 +62,14 @@ class Factor:
         with torch.no_grad():
             self.cholesky = _cholesky(kernel, observations, jitter)
             residual = _masked(observations.residual, observations.valid)
+            self.valid = observations.valid
             self.alpha = torch.cholesky_solve(residual.unsqueeze(-1), self.cholesky).squeeze(-1)
 
-    def condition(self, cross: Tensor, prior_variance: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean shift and variance of variables with covariance `cross` `(*batch, n, m)` to the force.
-
-        Returns Σᵀα and prior − diag(Σᵀ (K+σ_r²I)⁻¹ Σ), each `(*batch, m)`.
-        """
-        shift = (cross.mT @ self.alpha.unsqueeze(-1)).squeeze(-1)
-        half = torch.linalg.solve_triangular(self.cholesky, cross, upper=False)
-        # Rounding can push a variance of a fully determined variable just below zero.
-        return shift, (prior_variance - half.square().sum(-2)).clamp_min(0.0)
+    def whiten(self, columns: Tensor) -> Tensor:
+        """L⁻¹ `columns`, `(*batch, n, m)`; products of two such are inner products in (K + σ_r² I)⁻¹."""
+        if self.valid is not None:
+            columns = columns * self.valid.unsqueeze(-1)
+        return torch.linalg.solve_triangular(self.cholesky, columns, upper=False)
 
 
 def check_capacity(n: int, limit: int, where: str) -> None:

@@ -1,0 +1,219 @@
+"""From prepared samples to the inputs of the kernels: θ, θ̇, θ̈, ξ, ē and labels, batched over axes and groups."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from bayes_impedance.config import Component, Config, ModelConfig
+from bayes_impedance.errors import ConfigurationError
+from bayes_impedance.kernels.impedance import InputLayout
+from bayes_impedance.preprocessing import PreparedLog, PreparedTrial
+from bayes_impedance.trajectory_mean import TrajectoryMean, phase_derivatives
+
+Array = NDArray[np.float64]
+
+UNITS: Mapping[str, str] = {"time": "s", "phase": "1", "position": "m", "velocity": "m/s"}
+
+
+@dataclass(frozen=True)
+class Features:
+    """Kernel inputs of a log, one batch entry an axis and group.
+
+    `inputs` `(axes, groups, n, D)`; `force` `(axes, groups, n)` [N], None where the log has none;
+    `trajectory_mean` `(axes, groups, n, 3)`: μ_xd and its derivatives [m, m/s, m/s²]; `valid`
+    `(groups, n)` is False on padding, None where nothing is padded; `rows[g]` lists (trial, sample) of
+    each valid row.
+    """
+
+    groups: tuple[str, ...]
+    inputs: Tensor
+    force: Tensor | None
+    trajectory_mean: Tensor
+    valid: Tensor | None
+    rows: tuple[NDArray[np.int64], ...]
+
+
+class FeatureMap:
+    """Layout of the inputs that a configuration asks for, and the map from samples to them."""
+
+    def __init__(self, config: Config, axes: tuple[str, ...]) -> None:
+        model = config.model
+        self.model = model
+        self.axes = axes
+        self.theta = theta_components(model)
+        self.xi = tuple(dict.fromkeys((*model.stiffness.input, *model.damping.input, *_residual_input(model))))
+        shared = config.shared.desired_trajectory
+        self.trajectory_shared = model.trajectory_input != "time" if shared is None else shared
+        self.residual_shared = config.shared.residual
+        self._columns: dict[str, tuple[int, ...]] = {}
+        width = 0
+
+        def take(name: str, count: int) -> tuple[int, ...]:
+            nonlocal width
+            self._columns[name] = tuple(range(width, width + count))
+            width += count
+            return self._columns[name]
+
+        p = sum(self._size(component) for component in self.theta)
+        has_acceleration = model.trajectory_input != "time" and not model.drop_acceleration
+        self.layout = InputLayout(
+            theta=take("theta", p),
+            theta_velocity=take("theta_velocity", p),
+            theta_acceleration=take("theta_acceleration", p if has_acceleration else 0),
+            error=take("error", 0 if model.desired_trajectory.mean == "equilibrium" else 3),
+            trajectory=None if self.trajectory_shared else take("trajectory", 1)[0],
+            residual=None if self.residual_shared else take("residual", 1)[0],
+        )
+        for component in self.xi:
+            take(f"xi.{component}", self._size(component))
+        self.width = width
+
+    def active_dims(self, components: Sequence[Component]) -> tuple[int, ...]:
+        """Input columns of some components of ξ."""
+        return tuple(column for component in components for column in self._columns[f"xi.{component}"])
+
+    def labels(self, components: Sequence[str]) -> list[str]:
+        """Name of each dimension of a kernel over `components`: time, position_x, …"""
+        names: list[str] = []
+        for component in components:
+            names += [component] if self._size(component) == 1 and component in ("time", "phase") else [
+                f"{component}_{axis}" for axis in self.axes
+            ]  # fmt: skip
+        return names
+
+    def __call__(
+        self, log: PreparedLog, mean: TrajectoryMean, trial_labels: Mapping[str, int] | None = None
+    ) -> Features:
+        """Inputs of every sample of `log`; trials with equal label share what trials do not share otherwise.
+
+        `trial_labels` maps `trial_key` to a label, so that two logs can be put into one covariance.
+        """
+        labels = trial_labels or label_trials(log)
+        blocks = [self._trial(trial, mean, labels[trial_key(trial)]) for trial in log.trials]
+        groups = log.groups
+        members = [[i for i, trial in enumerate(log.trials) if trial.group == group] for group in groups]
+        lengths = [sum(len(log.trials[i].time) for i in member) for member in members]
+        n, a = max(lengths), len(self.axes)
+        has_force = all(trial.force is not None for trial in log.trials)
+        inputs = np.zeros((a, len(groups), n, self.width))
+        means = np.zeros((a, len(groups), n, 3))
+        force = np.zeros((a, len(groups), n))
+        valid = np.zeros((len(groups), n), dtype=bool)
+        rows = []
+        for g, (member, length) in enumerate(zip(members, lengths, strict=True)):
+            inputs[:, g, :length] = np.concatenate([blocks[i][0] for i in member], axis=1)
+            means[:, g, :length] = np.concatenate([blocks[i][1] for i in member], axis=1)
+            if has_force:
+                force[:, g, :length] = np.concatenate([log.trials[i].force for i in member]).T  # type: ignore[arg-type]
+            valid[g, :length] = True
+            rows.append(np.concatenate([_row_index(i, len(log.trials[i].time)) for i in member]))
+        return Features(
+            groups=groups,
+            inputs=torch.from_numpy(inputs),
+            force=torch.from_numpy(force) if has_force else None,
+            trajectory_mean=torch.from_numpy(means),
+            valid=None if valid.all() else torch.from_numpy(valid),
+            rows=tuple(rows),
+        )
+
+    def _trial(self, trial: PreparedTrial, mean: TrajectoryMean, label: int) -> tuple[Array, Array]:
+        n, a = len(trial.time), len(self.axes)
+        values = np.zeros((a, n, self.width))
+        theta = [self._values(trial, component) for component in self.theta]
+        values[..., list(self._columns["theta"])] = np.concatenate([part[0] for part in theta], axis=1)
+        velocity = [part[1] for part in theta]
+        if self.model.drop_acceleration:
+            velocity[-1] = np.zeros_like(velocity[-1])
+        values[..., list(self._columns["theta_velocity"])] = np.concatenate(velocity, axis=1)
+        if self.layout.theta_acceleration:
+            second = np.concatenate([part[2] for part in theta], axis=1)
+            values[..., list(self._columns["theta_acceleration"])] = second
+        for component in self.xi:
+            values[..., list(self._columns[f"xi.{component}"])] = self._values(trial, component)[0]
+        desired = mean.derivatives(trial)
+        hand = np.stack([trial.position, trial.velocity, trial.acceleration])
+        if self.layout.error:
+            values[..., list(self.layout.error)] = np.moveaxis(desired - hand, (0, 1, 2), (2, 1, 0))
+        for column in (self.layout.trajectory, self.layout.residual):
+            if column is not None:
+                values[..., column] = label
+        return values, np.moveaxis(desired, (0, 1, 2), (2, 1, 0))
+
+    def _values(self, trial: PreparedTrial, component: str) -> tuple[Array, Array, Array]:
+        """A component and its first two time derivatives, `(n, size)` each."""
+        if component == "time":
+            one = np.ones((len(trial.time), 1))
+            return (trial.time - trial.time[0])[:, None], one, np.zeros_like(one)
+        if component == "phase":
+            phase, rate, change = phase_derivatives(trial)
+            return phase[:, None], rate[:, None], change[:, None]
+        if component == "position":
+            return trial.position, trial.velocity, trial.acceleration
+        return trial.velocity, trial.acceleration, trial.jerk
+
+    def _size(self, component: str) -> int:
+        return 1 if component in ("time", "phase") else len(self.axes)
+
+
+def theta_components(model: ModelConfig) -> tuple[Component, ...]:
+    """Components of θ."""
+    if model.trajectory_input == "position_velocity":
+        return ("position", "velocity")
+    return (model.trajectory_input,)
+
+
+def baseline_components(config: Config) -> tuple[Component, ...]:
+    """Inputs of the naive GP: as configured, else all that the impedance model sees."""
+    if config.baseline.input is not None:
+        return config.baseline.input
+    model = config.model
+    every = (*theta_components(model), *model.stiffness.input, *model.damping.input, *_residual_input(model))
+    return tuple(dict.fromkeys(every))
+
+
+def check_combination(config: Config, log: PreparedLog) -> None:
+    """Refuse what the model cannot mean on this log.
+
+    Raises:
+        ConfigurationError: `equilibrium` with `phase` over several repetitions.
+    """
+    model = config.model
+    if model.trajectory_input == "phase" and model.desired_trajectory.mean == "equilibrium":
+        for group in log.groups:
+            count = sum(np.unique(trial.repetition).size for trial in log.trials if trial.group == group)
+            if count > 1:
+                raise ConfigurationError(
+                    "desired_trajectory.mean: expected trial_average, reference or constant with "
+                    f"trajectory_input: phase over repetitions, got equilibrium with {count} repetitions in group "
+                    f"'{group}'; the hand is not a function of phase there, so equilibrium would make "
+                    "x_d − x the shared function; set model.desired_trajectory.mean=trial_average"
+                )
+
+
+def trial_key(trial: PreparedTrial) -> str:
+    """Identity of a trial's motion, whatever its file is called."""
+    digest = hashlib.sha256(trial.group.encode())
+    for array in (trial.time, trial.position):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def label_trials(*logs: PreparedLog) -> dict[str, int]:
+    """One label for each distinct trial of the logs."""
+    keys = dict.fromkeys(trial_key(trial) for log in logs for trial in log.trials)
+    return {key: label for label, key in enumerate(keys)}
+
+
+def _residual_input(model: ModelConfig) -> tuple[Component, ...]:
+    return () if model.residual is None else model.residual.input
+
+
+def _row_index(trial: int, n: int) -> NDArray[np.int64]:
+    return np.stack([np.full(n, trial), np.arange(n)], axis=1)

@@ -1,0 +1,119 @@
+"""Verdict on every impedance estimate: do these data support it, or is it the prior (DESIGN §7)?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from bayes_impedance.config import Config
+from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
+from bayes_impedance.posterior import UNITS, Posterior
+
+#: A posterior SD of half the prior's, and of √¾ of it.
+SUPPORTED, WEAK = 0.75, 0.25
+
+
+class Support(Enum):
+    """How far the data carry an estimate."""
+
+    SUPPORTED = "supported by these data"
+    WEAK = "weakly supported"
+    PRIOR_ONLY = "prior only"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One impedance parameter on one axis: path averages in SI units, contraction, and a sentence."""
+
+    latent: Latent
+    axis: str
+    mean: float
+    q05: float
+    q95: float
+    prior_q05: float
+    prior_q95: float
+    contraction: float
+    support: Support
+    sentence: str
+
+    @property
+    def unit(self) -> str:
+        """SI unit of the estimate."""
+        return UNITS[self.latent]
+
+
+def assess(posterior: Posterior, config: Config) -> list[Verdict]:
+    """Verdicts on stiffness, damping and mass of each axis, averaged over the samples of `posterior`."""
+    verdicts = []
+    for latent in IMPEDANCE_ORDER:
+        marginal = posterior[latent]
+        low, high = marginal.quantile(0.05), marginal.quantile(0.95)
+        prior_low, prior_high = marginal.prior_quantile(0.05), marginal.prior_quantile(0.95)
+        for a, axis in enumerate(posterior.axes):
+            contraction = float(marginal.contraction[a])
+            support = classify(contraction)
+            verdicts.append(
+                Verdict(
+                    latent,
+                    axis,
+                    float(marginal.mean[:, a].mean()),
+                    float(low[:, a].mean()),
+                    float(high[:, a].mean()),
+                    float(prior_low[:, a].mean()),
+                    float(prior_high[:, a].mean()),
+                    contraction,
+                    support,
+                    _sentence(latent, axis, contraction, support, config, posterior),
+                )
+            )
+    return verdicts
+
+
+def classify(contraction: float) -> Support:
+    """Support from contraction: at least .75 supported, at least .25 weak, below that the prior."""
+    if contraction >= SUPPORTED:
+        return Support.SUPPORTED
+    return Support.WEAK if contraction >= WEAK else Support.PRIOR_ONLY
+
+
+def _sentence(
+    latent: Latent, axis: str, contraction: float, support: Support, config: Config, posterior: Posterior
+) -> str:
+    name = f"{latent.value} {axis}{axis}"
+    if np.isclose(posterior[latent].prior_scale[:, posterior.axes.index(axis)], 0.0).all():
+        return f"{name}: fixed by the configuration, so the data had no say."
+    share = f"the data removed {max(contraction, 0.0):.0%} of the prior variance"
+    mean = config.model.desired_trajectory.mean
+    if support is Support.PRIOR_ONLY:
+        if mean == "equilibrium":
+            reason = (
+                "with the equilibrium mean the force only tells the product of impedance and the desired "
+                "trajectory's SD"
+            )
+        else:
+            reason = "perturb the motion, repeat it, or give a reference"
+        return f"{name}: prior only; {share}: {reason}."
+    caveat = ""
+    if mean != "reference" and all(trial.perturbation is None for trial in posterior.log.trials):
+        caveat = (
+            ", provided that something other than this person perturbed the motion (no perturbation column is in "
+            "the log; without one the robot's own law can look like an arm)"
+        )
+    return f"{name}: {support.value}; {share}{caveat}."
+
+
+def summarise(verdicts: Iterable[Verdict]) -> dict[str, dict[str, float | str]]:
+    """JSON-able mapping from `stiffness_xx` … to estimate, interval, contraction and verdict."""
+    return {
+        f"{v.latent.value}_{v.axis}{v.axis}": {
+            "mean": v.mean,
+            "q05": v.q05,
+            "q95": v.q95,
+            "contraction": v.contraction,
+            "verdict": v.support.value,
+        }
+        for v in verdicts
+    }

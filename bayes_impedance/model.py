@@ -1,0 +1,214 @@
+"""The high level: configure, fit, posterior, evaluate."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from bayes_impedance.config import Config, load_config
+from bayes_impedance.engines.dense import check_capacity, log_marginal_likelihood
+from bayes_impedance.errors import ConfigurationError, LogError
+from bayes_impedance.features import FeatureMap, check_combination, label_trials, trial_key
+from bayes_impedance.identifiability import Verdict, assess
+from bayes_impedance.kernels.impedance import Latent
+from bayes_impedance.log import InteractionLog
+from bayes_impedance.posterior import Posterior, compute_posterior
+from bayes_impedance.preprocessing import PreparedLog, prepare
+from bayes_impedance.priors import Entry, ForceModel, build_force_model
+from bayes_impedance.training import Progress, TrainingReport, observations, train
+from bayes_impedance.trajectory_mean import TrajectoryMean
+
+Given = Literal["both", "training", "log"]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What a model knows after training: hyperparameters, the prepared log that gave them, and how."""
+
+    force_model: ForceModel
+    log: PreparedLog
+    report: TrainingReport
+
+
+class ImpedanceModel:
+    """Arm impedance and desired trajectory from motion and interaction force.
+
+    Immutable: `fit` returns a new model. Without a fit the hyperparameters stand at their medians.
+
+    Example:
+        >>> model = ImpedanceModel.from_config("phase")
+        >>> model.is_fitted
+        False
+    """
+
+    def __init__(self, config: Config, fit: Fit | None = None) -> None:
+        self.config = config
+        self._fit = fit
+
+    @classmethod
+    def from_config(cls, source: str | Path | Config, overrides: Iterable[str] = ()) -> ImpedanceModel:
+        """Model from a configuration file, the name of a shipped one, or a `Config`.
+
+        Raises:
+            ConfigurationError: see `load_config`.
+        """
+        return cls(source if isinstance(source, Config) else load_config(source, overrides))
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether `fit` made this model."""
+        return self._fit is not None
+
+    @property
+    def fitted(self) -> Fit:
+        """What training found.
+
+        Raises:
+            ConfigurationError: the model was not fitted.
+        """
+        if self._fit is None:
+            raise ConfigurationError("expected a fitted model, got an untrained one; call fit(log) first")
+        return self._fit
+
+    @property
+    def report(self) -> TrainingReport:
+        """How training went."""
+        return self.fitted.report
+
+    @property
+    def hyperparameters(self) -> tuple[Entry, ...]:
+        """Hyperparameters with unit, hyperprior and value `(axes, 1, 1, components)`."""
+        return self.fitted.force_model.entries
+
+    def prepare(self, log: InteractionLog | PreparedLog) -> PreparedLog:
+        """Smoothed, differentiated, resampled log, checked against the configuration.
+
+        Raises:
+            LogError, ConfigurationError: the log cannot serve this configuration.
+        """
+        prepared = log if isinstance(log, PreparedLog) else prepare(log, self.config.preprocessing)
+        check_combination(self.config, prepared)
+        if self._fit is not None and prepared.axes != self._fit.log.axes:
+            raise LogError(
+                f"expected a log with axes {', '.join(self._fit.log.axes)}, on which the model was trained, got "
+                f"{', '.join(prepared.axes)}; set log.axes"
+            )
+        return prepared
+
+    def fit(self, log: InteractionLog | PreparedLog, progress: Progress | None = None) -> ImpedanceModel:
+        """A new model with hyperparameters trained on `log` (MAP of the marginal likelihood).
+
+        Raises:
+            LogError, ConfigurationError, TooManySamplesError, NotPositiveDefiniteError.
+        """
+        prepared = ImpedanceModel(self.config).prepare(log)
+        feature_map = FeatureMap(self.config, prepared.axes)
+        features = feature_map(prepared, self._mean(prepared))
+        if features.force is None:
+            raise LogError("expected a log with force to train on, found none; name log.columns.force")
+        self._check_capacity(prepared)
+        force_model = build_force_model(self.config, feature_map)
+        report = train(force_model, features, self.config.training, self.config.engine.jitter, progress)
+        return ImpedanceModel(self.config, Fit(force_model, prepared, report))
+
+    def posterior(
+        self,
+        log: InteractionLog | PreparedLog,
+        given: Given = "both",
+        latents: Sequence[Latent] | None = None,
+    ) -> Posterior:
+        """Posterior of every latent at every sample of `log`.
+
+        `given`: the forces conditioned on: those of the training log ("training"), those of `log`
+        itself ("log"), or both, a trial that stands in both counting once.
+
+        Raises:
+            LogError, ConfigurationError, TooManySamplesError, NotPositiveDefiniteError.
+        """
+        prepared = self.prepare(log)
+        evidence = self._evidence(prepared, given)
+        feature_map = FeatureMap(self.config, prepared.axes)
+        mean = self._mean(prepared)
+        conditions = None
+        # One labelling for both, so that a trial that is target and evidence keeps its own x_d and ũ.
+        labels = label_trials(*([prepared] if evidence is None else [prepared, evidence]))
+        if evidence is not None:
+            self._check_capacity(evidence)
+            conditions = feature_map(evidence, mean, labels)
+        return compute_posterior(
+            self._force_model(feature_map),
+            prepared,
+            feature_map(prepared, mean, labels),
+            conditions,
+            self.config.engine.jitter,
+            latents,
+        )
+
+    def log_marginal_likelihood(self, log: InteractionLog | PreparedLog) -> dict[str, float]:
+        """log p(force of `log`) at the model's hyperparameters, by axis, summed over groups [nats].
+
+        Raises:
+            LogError, ConfigurationError, TooManySamplesError, NotPositiveDefiniteError.
+        """
+        prepared = self.prepare(log)
+        self._check_capacity(prepared)
+        feature_map = FeatureMap(self.config, prepared.axes)
+        features = feature_map(prepared, self._mean(prepared))
+        if features.force is None:
+            raise LogError("expected a log with force, found none; name log.columns.force")
+        model = self._force_model(feature_map)
+        with torch.no_grad():
+            value = log_marginal_likelihood(
+                model.kernel, observations(model, features), self.config.engine.jitter
+            ).sum(-1)
+        return dict(zip(prepared.axes, value.tolist(), strict=True))
+
+    def verdicts(self, posterior: Posterior | None = None) -> list[Verdict]:
+        """What the data say of stiffness, damping and mass; by default at the training samples."""
+        return assess(self.posterior(self.fitted.log) if posterior is None else posterior, self.config)
+
+    def force_model(self, axes: tuple[str, ...]) -> ForceModel:
+        """The gpytorch kernel, mean and likelihood underneath, to take into one's own code."""
+        return self._force_model(FeatureMap(self.config, axes))
+
+    def _force_model(self, feature_map: FeatureMap) -> ForceModel:
+        # A copy, so that nobody changes a fitted model from outside.
+        if self._fit is not None:
+            return copy.deepcopy(self._fit.force_model)
+        return build_force_model(self.config, feature_map)
+
+    def _mean(self, log: PreparedLog) -> TrajectoryMean:
+        """Prior mean of x_d, learned from the training log where there is one, else from `log` itself."""
+        source = log if self._fit is None else self._fit.log
+        return TrajectoryMean.from_training(self.config.model.desired_trajectory, source)
+
+    def _evidence(self, log: PreparedLog, given: Given) -> PreparedLog | None:
+        """Trials whose forces are conditioned on: of the groups of `log`, each motion once."""
+        trials = []
+        if given in ("both", "log"):
+            trials += [trial for trial in log.trials if trial.force is not None]
+        if given in ("both", "training") and self._fit is not None:
+            seen = {trial_key(trial) for trial in trials}
+            groups = set(log.groups)
+            trials += [
+                trial
+                for trial in self._fit.log.trials
+                if trial.group in groups and trial_key(trial) not in seen
+            ]
+        return replace(log, trials=tuple(trials)) if trials else None
+
+    def _check_capacity(self, log: PreparedLog) -> None:
+        for group in log.groups:
+            n = sum(len(trial.time) for trial in log.trials if trial.group == group)
+            check_capacity(n, self.config.engine.max_samples, f"group '{group}'")
+
+
+def concatenated_force(log: PreparedLog) -> np.ndarray:
+    """Force of every sample, `(samples, axes)` [N]; the log must have force."""
+    return np.concatenate([trial.force for trial in log.trials if trial.force is not None])

@@ -1,0 +1,329 @@
+"""Gaussian posteriors of every latent, given forces (DESIGN §5).
+
+The covariance between the force and another process is the primitive: predicting x_d is the same code as
+predicting u. Warped impedance is conditioned in the logarithm, so its quantiles are positive.
+
+Levels of stiffness, damping and mass that were learned are uncertain too. Their hyperprior enters as a
+Gaussian offset b_j of each process, linearised at the fitted level: u gains Σ_j ē_j sensitivity_j b_j. So
+where ē = 0 (the equilibrium prior) the posterior of an impedance keeps the whole width of its hyperprior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+from scipy.stats import norm
+from torch import Tensor
+
+from bayes_impedance.engines.dense import Factor
+from bayes_impedance.features import Features
+from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, TRAJECTORY_ORDER, InteractionKernel, Latent
+from bayes_impedance.preprocessing import PreparedLog
+from bayes_impedance.priors import ForceModel
+from bayes_impedance.training import observations
+
+Array = NDArray[np.float64]
+
+UNITS: Mapping[Latent, str] = {
+    Latent.FORCE: "N",
+    Latent.RESIDUAL_FORCE: "N",
+    Latent.DESIRED_POSITION: "m",
+    Latent.DESIRED_VELOCITY: "m/s",
+    Latent.DESIRED_ACCELERATION: "m/s²",
+    Latent.STIFFNESS: "N/m",
+    Latent.DAMPING: "Ns/m",
+    Latent.MASS: "kg",
+}
+
+#: Targets are taken this many at a time, which bounds memory whatever the length of the log.
+CHUNK = 512
+
+
+@dataclass(frozen=True)
+class Marginal:
+    """Posterior of one latent at each sample, beside its prior.
+
+    `location`, `scale`: mean and SD of the Gaussian variable, `(samples, axes)`: the latent, or its
+    logarithm where `warped`.
+    """
+
+    latent: Latent
+    warped: bool
+    location: Array
+    scale: Array
+    prior_location: Array
+    prior_scale: Array
+
+    @property
+    def mean(self) -> Array:
+        """Posterior mean, `(samples, axes)` [unit of the latent]."""
+        return np.exp(self.location + 0.5 * self.scale**2) if self.warped else self.location
+
+    @property
+    def sd(self) -> Array:
+        """Posterior SD, `(samples, axes)` [unit of the latent]."""
+        return self.mean * np.sqrt(np.expm1(self.scale**2)) if self.warped else self.scale
+
+    def quantile(self, probability: float) -> Array:
+        """Posterior quantile, `(samples, axes)` [unit of the latent]; positive where warped."""
+        return self._quantile(self.location, self.scale, probability)
+
+    def prior_quantile(self, probability: float) -> Array:
+        """Prior quantile, `(samples, axes)` [unit of the latent]."""
+        return self._quantile(self.prior_location, self.prior_scale, probability)
+
+    @property
+    def contraction(self) -> Array:
+        """1 − posterior variance / prior variance of the Gaussian variable, averaged over samples, `(axes,)`."""
+        prior = np.square(self.prior_scale).mean(axis=0)
+        posterior = np.square(self.scale).mean(axis=0)
+        # A latent that the configuration fixes has no variance to lose.
+        return np.where(prior > 0, 1.0 - posterior / np.where(prior > 0, prior, 1.0), 0.0)
+
+    def _quantile(self, location: Array, scale: Array, probability: float) -> Array:
+        value = location + scale * norm.ppf(probability)
+        return np.asarray(np.exp(value) if self.warped else value)
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Posteriors of the latents at every sample of a log; immutable.
+
+    `marginals[latent]` holds arrays `(samples, axes)`, samples in the order of `log`'s trials.
+    """
+
+    log: PreparedLog
+    marginals: Mapping[Latent, Marginal]
+
+    def __getitem__(self, latent: Latent | str) -> Marginal:
+        """Marginal of a latent, by member of `Latent` or by name ("stiffness")."""
+        return self.marginals[Latent(latent)]
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Axes of the log."""
+        return self.log.axes
+
+    def trial_slice(self, index: int) -> slice:
+        """Rows of trial `index` in the arrays of the marginals."""
+        start = sum(len(trial.time) for trial in self.log.trials[:index])
+        return slice(start, start + len(self.log.trials[index].time))
+
+    def table(self) -> pd.DataFrame:
+        """One row a sample: `trial`, `time` [s], then `<quantity>_<axis>_{mean,sd,q05,q95}` in SI units.
+
+        `source` and `group` precede where the log has several files or groups.
+        """
+        trials = self.log.trials
+        columns: dict[str, object] = {}
+        lengths = [len(trial.time) for trial in trials]
+        if len({trial.source for trial in trials}) > 1:
+            columns["source"] = np.repeat([trial.source for trial in trials], lengths)
+        if len({trial.group for trial in trials}) > 1:
+            columns["group"] = np.repeat([trial.group for trial in trials], lengths)
+        columns["trial"] = np.repeat([trial.name for trial in trials], lengths)
+        columns["time"] = np.concatenate([trial.time for trial in trials])
+        for latent, marginal in self.marginals.items():
+            low, high = marginal.quantile(0.05), marginal.quantile(0.95)
+            for a, axis in enumerate(self.axes):
+                name = f"{latent.value}_{axis}{axis if latent in IMPEDANCE_ORDER else ''}"
+                columns[f"{name}_mean"] = marginal.mean[:, a]
+                columns[f"{name}_sd"] = marginal.sd[:, a]
+                columns[f"{name}_q05"] = low[:, a]
+                columns[f"{name}_q95"] = high[:, a]
+        return pd.DataFrame(columns)
+
+
+def compute_posterior(
+    model: ForceModel,
+    log: PreparedLog,
+    target: Features,
+    given: Features | None,
+    jitter: float,
+    latents: Sequence[Latent] | None = None,
+) -> Posterior:
+    """Posteriors at `target`, the features of `log`, given the forces of `given`; the prior where it is None.
+
+    Groups of `target` without a namesake in `given` keep their prior.
+
+    Raises:
+        NotPositiveDefiniteError: the covariance of the given forces does not factorise.
+    """
+    if latents is None:
+        latents = list(Latent) if isinstance(model.kernel, InteractionKernel) else [Latent.FORCE]
+    known = [] if given is None else [g for g in target.groups if g in given.groups]
+    unknown = [g for g in target.groups if g not in known]
+    parts: list[tuple[list[str], dict[Latent, Moments]]] = []
+    with torch.no_grad():
+        if known:
+            assert given is not None
+            conditioner = _Conditioner(model, _select_groups(given, known), jitter)
+            parts.append((known, conditioner.moments(_select_groups(target, known), latents)))
+        if unknown:
+            parts.append((unknown, _prior_only(model, _select_groups(target, unknown), latents)))
+    return Posterior(log, {latent: _marginal(model, log, target, latent, parts) for latent in latents})
+
+
+#: Location, variance, prior location, prior variance, each `(axes, groups, m)`.
+Moments = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+class _Conditioner:
+    """Forces given once, conditioned on for any number of targets."""
+
+    def __init__(self, model: ForceModel, given: Features, jitter: float) -> None:
+        self.model, self.given = model, given
+        self.factor = Factor(model.kernel, observations(model, given), jitter)
+        self.levels = _levels(model, given.inputs)
+        if self.levels is not None:
+            loading, variance = self.levels
+            self.white_loading = self.factor.whiten(loading)
+            gram = self.white_loading.mT @ self.white_loading
+            root = variance.sqrt()
+            scaled = root.unsqueeze(-1) * gram * root.unsqueeze(-2)
+            # Covariance of b given the forces, V½ (I + V½ AᵀK⁻¹A V½)⁻¹ V½, defined for V = 0 too.
+            inner = torch.linalg.inv(torch.eye(gram.shape[-1], dtype=gram.dtype) + scaled)
+            self.level_covariance = root.unsqueeze(-1) * inner * root.unsqueeze(-2)
+
+    def moments(self, target: Features, latents: Sequence[Latent]) -> dict[Latent, Moments]:
+        result = {}
+        for latent in latents:
+            pieces = [self._chunk(piece, latent) for piece in _chunks(target)]
+            a, b, c, d = zip(*pieces, strict=True)
+            result[latent] = tuple(torch.cat(part, dim=-1) for part in (a, b, c, d))
+        return result  # type: ignore[return-value]
+
+    def _chunk(self, target: Features, latent: Latent) -> Moments:
+        cross = _cross_covariance(self.model, self.given.inputs, target.inputs, latent)
+        white = self.factor.whiten(cross)
+        alpha = self.factor.alpha.unsqueeze(-1)
+        if self.given.valid is not None:
+            alpha = alpha * self.given.valid.unsqueeze(-1)
+        prior_location, prior_variance = _prior(self.model, target, latent)
+        location = prior_location + (cross.mT @ alpha).squeeze(-1)
+        # Rounding can push the variance of a fully determined variable just below zero.
+        variance = (_own_variance(self.model, target, latent) - white.square().sum(-2)).clamp_min(0.0)
+        if self.levels is not None:
+            loading = _level_loading(self.model, target.inputs, latent) - white.mT @ self.white_loading
+            variance = variance + ((loading @ self.level_covariance) * loading).sum(-1)
+        if latent is Latent.FORCE:
+            variance = variance + self.model.noise_variance
+        return location, variance, prior_location.expand_as(location), prior_variance.expand_as(location)
+
+
+def _prior_only(model: ForceModel, target: Features, latents: Sequence[Latent]) -> dict[Latent, Moments]:
+    result = {}
+    for latent in latents:
+        location, variance = _prior(model, target, latent)
+        shape = target.inputs.shape[:-1]
+        result[latent] = (
+            location.expand(shape), variance.expand(shape), location.expand(shape), variance.expand(shape),
+        )  # fmt: skip
+    return result
+
+
+def _cross_covariance(model: ForceModel, x1: Tensor, x2: Tensor, latent: Latent) -> Tensor:
+    if isinstance(model.kernel, InteractionKernel):
+        return model.kernel.cross_covariance(x1, x2, latent)
+    return model.kernel(x1, x2).to_dense()
+
+
+def _own_variance(model: ForceModel, target: Features, latent: Latent) -> Tensor:
+    """Prior variance at known levels, without noise."""
+    if isinstance(model.kernel, InteractionKernel):
+        return model.kernel.prior_variance(target.inputs, latent)
+    return model.kernel(target.inputs, diag=True)
+
+
+def _prior(model: ForceModel, target: Features, latent: Latent) -> tuple[Tensor, Tensor]:
+    """Prior location and variance, with the variance of the levels and, for force, of the noise."""
+    variance = _own_variance(model, target, latent)
+    levels = _levels(model, target.inputs)
+    if levels is not None:
+        loading = _level_loading(model, target.inputs, latent)
+        variance = variance + (loading.square() * levels[1].unsqueeze(-2)).sum(-1)
+    if latent is Latent.FORCE:
+        return model.prior_mean(target.inputs), variance + model.noise_variance
+    if latent is Latent.RESIDUAL_FORCE:
+        return torch.zeros_like(variance), variance
+    if latent in TRAJECTORY_ORDER:
+        return target.trajectory_mean[..., TRAJECTORY_ORDER[latent]], variance
+    process = model.kernel.impedance.processes[IMPEDANCE_ORDER[latent]]
+    level = process.level[..., 0]
+    return (level if process.law == "gaussian" else level.log()), variance
+
+
+def _levels(model: ForceModel, inputs: Tensor) -> tuple[Tensor, Tensor] | None:
+    """∂E[u]/∂b_j `(axes, groups, n, 3)` and Var[b_j] `(axes, 1, 3)`; None for a naive GP."""
+    if not isinstance(model.kernel, InteractionKernel):
+        return None
+    variances = []
+    entries = {entry.name: entry for entry in model.entries}
+    for latent, order in IMPEDANCE_ORDER.items():
+        process = model.kernel.impedance.processes[order]
+        spec = entries[f"{latent.value}.level"].specs[0]
+        log_sd = 0.0 if spec.fixed else spec.log_sd
+        scale = process.level[..., 0] if process.law == "gaussian" else torch.ones_like(process.level[..., 0])
+        variances.append((scale * log_sd).square())
+    return _level_loading(model, inputs, Latent.FORCE), torch.cat(variances, dim=-1)
+
+
+def _level_loading(model: ForceModel, inputs: Tensor, latent: Latent) -> Tensor:
+    """Derivative of the latent's prior location by each b_j, `(axes, groups, n, 3)`."""
+    impedance = model.kernel.impedance
+    loading = inputs.new_zeros(*inputs.shape[:-1], len(IMPEDANCE_ORDER))
+    if latent in IMPEDANCE_ORDER:
+        loading[..., IMPEDANCE_ORDER[latent]] = 1.0
+    errors = impedance.layout.errors(inputs, impedance.order)
+    if latent is Latent.FORCE and errors is not None:
+        for j, process in enumerate(impedance.processes):
+            loading[..., j] = (errors[j] * process.sensitivity(inputs)).squeeze(-1)
+    return loading
+
+
+def _marginal(
+    model: ForceModel, log: PreparedLog, target: Features, latent: Latent,
+    parts: Sequence[tuple[list[str], dict[Latent, Moments]]],
+) -> Marginal:  # fmt: skip
+    """Undo the batching: rows of groups back to samples of trials."""
+    starts = np.cumsum([0, *(len(trial.time) for trial in log.trials)])
+    arrays = np.empty((4, starts[-1], len(log.axes)))
+    for groups, moments in parts:
+        stacked = torch.stack(moments[latent]).numpy()
+        for g, group in enumerate(groups):
+            rows = target.rows[target.groups.index(group)]
+            arrays[:, starts[rows[:, 0]] + rows[:, 1]] = np.moveaxis(stacked[:, :, g, : len(rows)], 1, 2)
+    location, variance, prior_location, prior_variance = arrays
+    warped = (
+        latent in IMPEDANCE_ORDER
+        and model.kernel.impedance.processes[IMPEDANCE_ORDER[latent]].law == "log_gaussian"
+    )
+    return Marginal(latent, warped, location, np.sqrt(variance), prior_location, np.sqrt(prior_variance))
+
+
+def _select_groups(features: Features, groups: Sequence[str]) -> Features:
+    index = [features.groups.index(group) for group in groups]
+    return Features(
+        groups=tuple(groups),
+        inputs=features.inputs[:, index],
+        force=None if features.force is None else features.force[:, index],
+        trajectory_mean=features.trajectory_mean[:, index],
+        valid=None if features.valid is None else features.valid[index],
+        rows=tuple(features.rows[i] for i in index),
+    )
+
+
+def _chunks(features: Features) -> list[Features]:
+    n = features.inputs.shape[2]
+    return [
+        Features(
+            features.groups, features.inputs[:, :, s : s + CHUNK], None,
+            features.trajectory_mean[:, :, s : s + CHUNK], None, features.rows,
+        )
+        for s in range(0, n, CHUNK)
+    ]  # fmt: skip

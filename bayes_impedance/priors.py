@@ -1,0 +1,324 @@
+"""Hyperpriors, and the gpytorch modules that a configuration stands for.
+
+Every hyperparameter is positive with a log-normal hyperprior; MAP works on the logarithm, so that
+the hyperprior alone puts the mode at the stated median whatever its width.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gpytorch
+import torch
+from gpytorch.constraints import Interval
+from gpytorch.kernels import AdditiveKernel, Kernel
+from gpytorch.likelihoods import GaussianLikelihood
+from gpytorch.priors import NormalPrior
+from torch import Tensor
+
+from bayes_impedance.config import LARGEST_LOG_SD, Component, Config, Hyperparameter, ImpedancePrior, LengthScales
+from bayes_impedance.features import UNITS, FeatureMap, baseline_components, theta_components
+from bayes_impedance.kernels.impedance import ImpedanceKernel, InputLayout, InteractionKernel
+from bayes_impedance.kernels.stationary import StationaryKernel, log_positive
+from bayes_impedance.kernels.warped import ImpedanceProcess
+
+#: Constrained values stay inside the open interval that their constraint maps to.
+INSIDE = 1e-3
+
+
+class LogScalePrior(NormalPrior):  # type: ignore[misc]
+    """log h ~ N(log median, log_sd²), as a density over log h: its mode is the median of h."""
+
+    def __init__(self, median: Tensor, log_sd: Tensor) -> None:
+        super().__init__(median.log(), log_sd)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Density of log h at h = `value` [nats]."""
+        return super().log_prob(value.log())
+
+    def rsample(self, sample_shape: torch.Size = torch.Size()) -> Tensor:  # noqa: B008 - torch's own default
+        """Draws of h."""
+        return super().rsample(sample_shape).exp()
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One hyperparameter of a force model: where it lives, its unit and hyperprior.
+
+    `specs[c]` is the hyperprior of component c of the last dimension, `labels[c]` its name; `power` maps
+    the module's value to the one that users see (σ_r from a variance).
+    """
+
+    name: str
+    unit: str
+    labels: tuple[str, ...]
+    specs: tuple[Hyperparameter, ...]
+    raw: torch.nn.Parameter
+    constraint: Interval
+    units: tuple[str, ...]
+    power: float = 1.0
+
+    @property
+    def value(self) -> Tensor:
+        """Value in the unit users see, `(axes, 1, 1, components)`."""
+        shape = (*self.raw.shape[:1], 1, 1, len(self.specs))
+        return self.constraint.transform(self.raw).reshape(shape) ** self.power
+
+    @property
+    def free(self) -> Tensor:
+        """True for components that are learned."""
+        return torch.tensor([not spec.fixed for spec in self.specs])
+
+    def inverse(self, value: Tensor) -> Tensor:
+        """Unconstrained value, in the shape of `raw`, for `value` as users see it."""
+        inner = value ** (1.0 / self.power)
+        low, high = self.constraint.lower_bound, self.constraint.upper_bound
+        if torch.isfinite(high).all():
+            inner = inner.clamp(float(low) + INSIDE, float(high) - INSIDE)
+        return self.constraint.inverse_transform(inner.expand(self.raw.shape[0], 1, 1, -1).reshape(self.raw.shape))
+
+    @property
+    def medians(self) -> Tensor:
+        """Medians of the hyperprior, `(components,)`."""
+        return torch.tensor([spec.median for spec in self.specs], dtype=self.raw.dtype)
+
+    @property
+    def log_sds(self) -> Tensor:
+        """Log-SD of the hyperprior, `(components,)`."""
+        return torch.tensor([spec.log_sd for spec in self.specs], dtype=self.raw.dtype)
+
+
+class ForceModel(gpytorch.Module):  # type: ignore[misc]
+    """Kernel, prior mean and noise of the force, with its hyperparameters listed.
+
+    Batch shape of every hyperparameter is `(axes, 1)`: one value an axis, shared by groups.
+    """
+
+    def __init__(
+        self, kernel: Kernel, likelihood: GaussianLikelihood, entries: Callable[[ForceModel], Sequence[Entry]]
+    ) -> None:
+        super().__init__()
+        self.kernel = kernel
+        self.likelihood = likelihood
+        self._list_entries = entries
+        # Second derivatives of a kernel lose positive definiteness in single precision.
+        self.double()
+        for entry in self.entries:
+            with torch.no_grad():
+                entry.raw.copy_(entry.inverse(entry.medians))
+            entry.raw.requires_grad_(bool(entry.free.any()))
+
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        """Every hyperparameter, in the order in which it is shown."""
+        return tuple(self._list_entries(self))
+
+    def prior_mean(self, inputs: Tensor) -> Tensor:
+        """E[u], `(axes, groups, n)` [N]."""
+        if isinstance(self.kernel, InteractionKernel):
+            return self.kernel.prior_mean(inputs)
+        return inputs.new_zeros(inputs.shape[:-1])
+
+    @property
+    def noise_variance(self) -> Tensor:
+        """σ_r², `(axes, 1, 1)` [N²]."""
+        return self.likelihood.noise
+
+    def log_prior(self) -> Tensor:
+        """Log density of the hyperpriors, `(axes,)` [nats]."""
+        total = torch.zeros((), dtype=torch.float64)
+        for _, module, prior, closure, _ in self.named_priors():
+            density = prior.log_prob(closure(module))
+            total = total + density.reshape(density.shape[0], -1).sum(-1)
+        return total
+
+
+def build_force_model(config: Config, features: FeatureMap) -> ForceModel:
+    """The interaction kernel, its mean and noise, at the hyperprior medians."""
+    model = config.model
+    batch = torch.Size([len(features.axes), 1])
+    trajectory = _stationary(
+        model.desired_trajectory.kernel,
+        theta_components(model),
+        features,
+        model.desired_trajectory.length_scale,
+        model.desired_trajectory.sd,
+        batch,
+        active_dims=None,
+        shape=model.desired_trajectory.shape,
+    )
+    stiffness = _impedance(model.stiffness, features, batch)
+    damping = _impedance(model.damping, features, batch)
+    mass = ImpedanceProcess(
+        StationaryKernel(num_dims=0, batch_shape=batch, sd_prior=_prior(model.mass.sd)),
+        law="gaussian",
+        level_prior=_prior(model.mass.level),
+        batch_shape=batch,
+    )
+    residual = None
+    if model.residual is not None:
+        dims = features.active_dims(model.residual.input)
+        residual = _stationary(
+            "squared_exponential", model.residual.input, features, model.residual.length_scale,
+            model.residual.sd, batch, dims,
+        )  # fmt: skip
+        if model.residual.offset_sd is not None:
+            offset = StationaryKernel(num_dims=0, batch_shape=batch, sd_prior=_prior(model.residual.offset_sd))
+            residual = AdditiveKernel(residual, offset)
+    layout: InputLayout = features.layout
+    kernel = InteractionKernel(ImpedanceKernel(layout, trajectory, stiffness, damping, mass), residual)
+
+    def entries(force_model: ForceModel) -> list[Entry]:
+        impedance = force_model.kernel.impedance
+        listed = [
+            _entry("stiffness.level", "N/m", impedance.stiffness, "level", model.stiffness.level),
+            *_process_entries("stiffness", "N/m", impedance.stiffness, model.stiffness, features),
+            _entry("damping.level", "Ns/m", impedance.damping, "level", model.damping.level),
+            *_process_entries("damping", "Ns/m", impedance.damping, model.damping, features),
+            _entry("mass.level", "kg", impedance.mass, "level", model.mass.level),
+            _entry("mass.sd", "kg", impedance.mass.covariance, "sd", model.mass.sd),
+            _entry("desired_trajectory.sd", "m", impedance.trajectory, "sd", model.desired_trajectory.sd),
+            _length_scales(
+                "desired_trajectory", impedance.trajectory, model.desired_trajectory.length_scale,
+                theta_components(model), features,
+            ),
+        ]  # fmt: skip
+        if impedance.trajectory.profile.has_shape:
+            shape = model.desired_trajectory.shape
+            listed.append(_entry("desired_trajectory.shape", "1", impedance.trajectory, "shape", shape))
+        if model.residual is not None:
+            part = force_model.kernel.residual
+            if model.residual.offset_sd is not None:
+                part, offset = part.kernels
+                listed.append(_entry("residual.offset_sd", "N", offset, "sd", model.residual.offset_sd))
+            listed += _residual_entries(part, config, model.residual.input, features)
+        listed.append(_noise_entry(force_model, config))
+        return listed
+
+    return ForceModel(kernel, _likelihood(config, batch), entries)
+
+
+def build_naive_model(config: Config, features: FeatureMap) -> ForceModel:
+    """Squared-exponential GP on the baseline's inputs, with the residual's hyperpriors."""
+    batch = torch.Size([len(features.axes), 1])
+    components = baseline_components(config)
+    assert config.model.residual is not None
+    residual = config.model.residual
+    kernel = _stationary(
+        "squared_exponential", components, features, residual.length_scale, residual.sd, batch,
+        features.active_dims(components),
+    )  # fmt: skip
+
+    def entries(force_model: ForceModel) -> list[Entry]:
+        listed = _residual_entries(force_model.kernel, config, components, features)
+        return [*listed, _noise_entry(force_model, config)]
+
+    return ForceModel(kernel, _likelihood(config, batch), entries)
+
+
+def _stationary(
+    profile: str, components: Sequence[Component], features: FeatureMap, length_scale: LengthScales,
+    sd: Hyperparameter, batch: torch.Size, active_dims: tuple[int, ...] | None,
+    shape: Hyperparameter | None = None,
+) -> StationaryKernel:  # fmt: skip
+    specs = _length_scale_specs(length_scale, components, features)
+    return StationaryKernel(
+        profile=profile,
+        num_dims=len(specs),
+        batch_shape=batch,
+        active_dims=active_dims,
+        sd_prior=_prior(sd),
+        lengthscale_prior=_prior(*specs) if specs else None,
+        shape_prior=None if shape is None else _prior(shape),
+    )
+
+
+def _impedance(prior: ImpedancePrior, features: FeatureMap, batch: torch.Size) -> ImpedanceProcess:
+    specs = _length_scale_specs(prior.length_scale, prior.input, features)
+    learned_log_sd = prior.prior == "log_gp" and not prior.scale.fixed
+    covariance = StationaryKernel(
+        num_dims=len(specs),
+        batch_shape=batch,
+        active_dims=features.active_dims(prior.input) if specs else None,
+        sd_prior=_prior(prior.scale),
+        # Beyond this log-SD the Gaussian approximation of the force fails, so training may not go there.
+        sd_constraint=Interval(0.0, LARGEST_LOG_SD) if learned_log_sd else None,
+        lengthscale_prior=_prior(*specs) if specs else None,
+    )
+    law = "log_gaussian" if prior.prior == "log_gp" else "gaussian"
+    return ImpedanceProcess(covariance, law, level_prior=_prior(prior.level), batch_shape=batch)
+
+
+def _likelihood(config: Config, batch: torch.Size) -> GaussianLikelihood:
+    spec = config.model.noise_sd
+    # log σ_r² = 2 log σ_r: the same hyperprior, stated for the variance that gpytorch keeps.
+    prior = LogScalePrior(
+        torch.tensor([spec.median**2], dtype=torch.float64),
+        torch.tensor([2.0 * spec.log_sd], dtype=torch.float64),
+    )
+    return GaussianLikelihood(noise_prior=prior, noise_constraint=log_positive(), batch_shape=batch)
+
+
+def _prior(*specs: Hyperparameter) -> LogScalePrior:
+    return LogScalePrior(
+        torch.tensor([[spec.median for spec in specs]], dtype=torch.float64),
+        torch.tensor([[spec.log_sd for spec in specs]], dtype=torch.float64),
+    )
+
+
+def _length_scale_specs(
+    length_scale: LengthScales, components: Sequence[str], features: FeatureMap
+) -> list[Hyperparameter]:
+    return [
+        getattr(length_scale, component)
+        for component in components
+        for _ in features.labels([component])
+    ]
+
+
+def _entry(name: str, unit: str, module: Any, attribute: str, spec: Hyperparameter) -> Entry:
+    raw, constraint = getattr(module, f"raw_{attribute}"), getattr(module, f"raw_{attribute}_constraint")
+    return Entry(name, unit, ("",), (spec,), raw, constraint, (unit,))
+
+
+def _length_scales(
+    name: str, module: StationaryKernel, length_scale: LengthScales, components: Sequence[str],
+    features: FeatureMap,
+) -> Entry:  # fmt: skip
+    specs = tuple(_length_scale_specs(length_scale, components, features))
+    labels = tuple(features.labels(components))
+    units = tuple(UNITS[component] for component in components for _ in features.labels([component]))
+    return Entry(
+        f"{name}.length_scale", units[0], labels, specs,
+        module.raw_lengthscale, module.raw_lengthscale_constraint, units,
+    )  # fmt: skip
+
+
+def _process_entries(
+    name: str, unit: str, process: ImpedanceProcess, prior: ImpedancePrior, features: FeatureMap
+) -> list[Entry]:
+    log = prior.prior == "log_gp"
+    scale_name, scale_unit = ("log_sd", "1") if log else ("sd", unit)
+    entries = [_entry(f"{name}.{scale_name}", scale_unit, process.covariance, "sd", prior.scale)]
+    if prior.input:
+        entries.append(_length_scales(name, process.covariance, prior.length_scale, prior.input, features))
+    return entries
+
+
+def _residual_entries(
+    kernel: StationaryKernel, config: Config, components: Sequence[str], features: FeatureMap
+) -> list[Entry]:
+    assert config.model.residual is not None
+    residual = config.model.residual
+    return [
+        _entry("residual.sd", "N", kernel, "sd", residual.sd),
+        _length_scales("residual", kernel, residual.length_scale, components, features),
+    ]
+
+
+def _noise_entry(force_model: ForceModel, config: Config) -> Entry:
+    noise = force_model.likelihood.noise_covar
+    spec = config.model.noise_sd
+    return Entry("noise_sd", "N", ("",), (spec,), noise.raw_noise, noise.raw_noise_constraint, ("N",), power=0.5)

@@ -1,0 +1,198 @@
+"""Data drawn from the model itself: true products of drawn impedance and drawn desired trajectory.
+
+Nothing here is Gaussian in u, because u = Σ_j w_j e⁽ʲ⁾ + ũ + ε is formed as it stands; the truth of
+every latent is kept beside the force.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from bayes_impedance.config import Config
+from bayes_impedance.features import FeatureMap, Features
+from bayes_impedance.kernels.derivative import derivative_table
+from bayes_impedance.kernels.impedance import same_label
+from bayes_impedance.log import InteractionLog, Trial
+from bayes_impedance.preprocessing import PreparedLog, PreparedTrial
+from bayes_impedance.priors import ForceModel, build_force_model
+from bayes_impedance.trajectory_mean import TrajectoryMean
+
+Array = NDArray[np.float64]
+
+
+def repeated_motion(
+    repetitions: int = 4,
+    duration: float = 4.0,
+    rate: float = 50.0,
+    displacement_sd: float = 0.02,
+    axes: tuple[str, ...] = ("x", "y"),
+    seed: int = 0,
+    group: str = "0",
+) -> PreparedLog:
+    """Motions along one closed path, each repetition perturbed and paced in its own way, without force.
+
+    Path: a figure of eight, .2 m wide, as `reference` [m]. Displacement: five sinusoids of .3 to 2 Hz with
+    SD `displacement_sd` [m]. Every derivative is exact. `duration` [s] and `rate` [Hz] of a repetition.
+    """
+    generator = np.random.default_rng(seed)
+    trials = []
+    for repetition in range(repetitions):
+        time = np.arange(round(duration * rate)) / rate
+        phase, phase_velocity, phase_acceleration = _pace(time, duration, generator)
+        path, path_velocity, path_acceleration, path_jerk = _path(
+            phase, phase_velocity, phase_acceleration, len(axes)
+        )
+        offset = _displacement(time, displacement_sd, len(axes), generator)
+        trials.append(
+            PreparedTrial(
+                name=str(repetition),
+                group=group,
+                source="memory",
+                time=time,
+                position=path + offset[0],
+                velocity=path_velocity + offset[1],
+                acceleration=path_acceleration + offset[2],
+                jerk=path_jerk + offset[3],
+                repetition=np.zeros(len(time), dtype=np.int64),
+                phase=phase,
+                phase_velocity=phase_velocity,
+                phase_acceleration=phase_acceleration,
+                reference=path,
+                reference_velocity=path_velocity,
+                reference_acceleration=path_acceleration,
+            )
+        )
+    return PreparedLog(axes, tuple(trials))
+
+
+def draw_force(
+    config: Config, motion: PreparedLog, seed: int, force_model: ForceModel | None = None
+) -> PreparedLog:
+    """`motion` with force drawn from the model, and the truth of every latent.
+
+    Hyperparameters are those of `force_model`, else the medians of `config`. Impedance and, where trials
+    share it, the desired trajectory are drawn once a group.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    feature_map = FeatureMap(config, motion.axes)
+    mean = TrajectoryMean.from_training(config.model.desired_trajectory, motion)
+    features = feature_map(motion, mean)
+    model = build_force_model(config, feature_map) if force_model is None else force_model
+    with torch.no_grad():
+        drawn = {
+            group: _draw_group(model, features, g, generator) for g, group in enumerate(features.groups)
+        }
+    trials = []
+    counts = dict.fromkeys(features.groups, 0)
+    for trial in motion.trials:
+        rows = slice(counts[trial.group], counts[trial.group] + len(trial.time))
+        counts[trial.group] = rows.stop
+        desired, impedance, residual, noise = (part[:, rows] for part in drawn[trial.group])
+        hand = np.stack([trial.position.T, trial.velocity.T, trial.acceleration.T], axis=-1)
+        # u = Σ_j w_j e⁽ʲ⁾ + ũ + ε, with w = (k, d, m)
+        force = (impedance * (desired - hand)).sum(-1) + residual + noise
+        truth: dict[str, Array] = {}
+        for a, axis in enumerate(motion.axes):
+            truth[f"desired_position_{axis}"] = desired[a, :, 0]
+            truth[f"desired_velocity_{axis}"] = desired[a, :, 1]
+            truth[f"desired_acceleration_{axis}"] = desired[a, :, 2]
+            truth[f"residual_force_{axis}"] = residual[a]
+            for j, name in enumerate(("stiffness", "damping", "mass")):
+                truth[f"{name}_{axis}{axis}"] = impedance[a, :, j]
+        trials.append(replace(trial, force=np.ascontiguousarray(force.T), truth=truth))
+    return PreparedLog(motion.axes, tuple(trials))
+
+
+def as_recording(prepared: PreparedLog, *, keep_reference: bool = False) -> InteractionLog:
+    """What a logger would have written of drawn data: time, position, force, phase, and the truth beside."""
+    trials = tuple(
+        Trial(
+            name=trial.name, group=trial.group, source=trial.source, time=trial.time,
+            position=trial.position, force=trial.force, repetition=trial.repetition, phase=trial.phase,
+            reference=trial.reference if keep_reference else None, truth=trial.truth,
+        )
+        for trial in prepared.trials
+    )  # fmt: skip
+    return InteractionLog(prepared.axes, trials)
+
+
+def _draw_group(
+    model: ForceModel, features: Features, group: int, generator: torch.Generator
+) -> tuple[Array, Array, Array, Array]:
+    """Desired trajectory `(axes, n, 3)`, impedance `(axes, n, 3)`, residual and noise `(axes, n)`."""
+    n = len(features.rows[group])
+    x = features.inputs[:, group : group + 1, :n]
+    kernel = model.kernel
+    impedance = kernel.impedance
+    path = impedance.layout.path(x)
+    common, table = derivative_table(impedance.trajectory, path, path)
+    shared = same_label(x, x, impedance.layout.trajectory)
+    common = common if shared is None else common * shared
+    rows = [torch.cat([(common * table[i][j]).expand_as(common) for j in range(3)], dim=-1) for i in range(3)]
+    deviation = _sample(torch.cat(rows, dim=-2), generator)
+    desired = features.trajectory_mean[:, group : group + 1, :n] + torch.stack(deviation.split(n, dim=-1), dim=-1)
+    columns = []
+    for process in impedance.processes:
+        draw = _sample(process.gaussian_covariance(x, x), generator)
+        level = process.level[..., 0]
+        columns.append(level + draw if process.law == "gaussian" else level * draw.exp())
+    residual = _sample(kernel.residual_covariance(x, x), generator)
+    standard = torch.randn(residual.shape, generator=generator, dtype=residual.dtype)
+    noise = model.noise_variance.sqrt() * standard
+    parts = (desired, torch.stack(columns, dim=-1), residual, noise)
+    return tuple(part[:, 0].numpy() for part in parts)  # type: ignore[return-value]
+
+
+def _sample(covariance: Tensor, generator: torch.Generator) -> Tensor:
+    """A draw of N(0, covariance), `(..., n)`; positive semidefinite is enough."""
+    scale = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
+    # On the scale of correlations rounding does not carry from accelerations over to positions.
+    safe = torch.where(scale > 0, scale, 1.0)
+    correlation = covariance / (safe.unsqueeze(-1) * safe.unsqueeze(-2))
+    values, vectors = torch.linalg.eigh(correlation)
+    standard = torch.randn(values.shape, generator=generator, dtype=values.dtype)
+    return scale * ((vectors * values.clamp_min(0.0).sqrt().unsqueeze(-2)) @ standard.unsqueeze(-1)).squeeze(-1)
+
+
+def _pace(time: Array, duration: float, generator: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Phase from .01 to .99, quicker here and slower there, with its time derivatives."""
+    uneven, shift = 0.15 * generator.uniform(-1.0, 1.0), generator.uniform(0.0, 2.0 * math.pi)
+    omega = 2.0 * math.pi / duration
+    span = 0.98
+    linear = time / duration
+    wave = np.sin(omega * time + shift) - math.sin(shift)
+    phase = 0.01 + span * (linear + uneven * wave / (2.0 * math.pi))
+    velocity = span / duration * (1.0 + uneven * np.cos(omega * time + shift))
+    acceleration = -span / duration * uneven * omega * np.sin(omega * time + shift)
+    return phase, velocity, acceleration
+
+
+def _path(phase: Array, velocity: Array, acceleration: Array, axes: int) -> tuple[Array, Array, Array, Array]:
+    """Figure of eight over phase and its time derivatives; the jerk neglects that of the phase."""
+    amplitude = np.array([0.1, 0.05, 0.03])[:axes]
+    omega = 2.0 * math.pi * np.array([1.0, 2.0, 1.0])[:axes]
+    shift = np.array([0.0, 0.0, 0.5 * math.pi])[:axes]
+    angle = phase[:, None] * omega + shift
+    rate, change = velocity[:, None], acceleration[:, None]
+    d0, d1 = amplitude * np.sin(angle), amplitude * omega * np.cos(angle)
+    d2, d3 = -(omega**2) * d0, -(omega**2) * d1
+    return d0, d1 * rate, d2 * rate**2 + d1 * change, d3 * rate**3 + 3.0 * d2 * rate * change
+
+
+def _displacement(time: Array, sd: float, axes: int, generator: np.random.Generator) -> Array:
+    """Sum of five sinusoids and its first three derivatives, `(4, n, axes)`."""
+    terms = 5
+    omega = 2.0 * math.pi * generator.uniform(0.3, 2.0, size=(terms, axes))
+    shift = generator.uniform(0.0, 2.0 * math.pi, size=(terms, axes))
+    angle = time[:, None, None] * omega + shift
+    derivatives = []
+    for order in range(4):
+        wave = np.sin(angle + 0.5 * math.pi * order)
+        derivatives.append((omega**order * wave).sum(axis=1) * sd * math.sqrt(2.0 / terms))
+    return np.stack(derivatives)

@@ -1,0 +1,299 @@
+"""Hyperparameters from the marginal likelihood: MAP by L-BFGS with restarts, and its Laplace approximation.
+
+Axes have their own hyperparameters and share none, so one objective is optimised for all of them
+together (each evaluation is batched over axes and groups) and the best restart is chosen an axis at a time.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from torch import Tensor
+
+from bayes_impedance.config import TrainingConfig
+from bayes_impedance.engines.dense import Observations, log_marginal_likelihood
+from bayes_impedance.errors import NotPositiveDefiniteError
+from bayes_impedance.features import Features
+from bayes_impedance.priors import Entry, ForceModel
+
+Array = NDArray[np.float64]
+
+#: The optimiser stays within this many hyperprior log-SDs of the median: beyond, a density of e⁻¹⁸
+#: and overflowing covariances are all there is.
+BOUND = 6.0
+#: Unconstrained range of a hyperparameter that lives in an interval (a sigmoid).
+INTERVAL_BOUND = 8.0
+HESSIAN_STEP = 1e-3
+
+
+@dataclass(frozen=True)
+class RestartReport:
+    """How one restart ended; `objective` log posterior density and `log_likelihood`, one an axis [nats]."""
+
+    restart: int
+    objective: tuple[float, ...]
+    log_likelihood: tuple[float, ...]
+    iterations: int
+    evaluations: int
+    seconds: float
+    outcome: str
+
+
+@dataclass(frozen=True)
+class TrainingReport:
+    """Result of training.
+
+    `best[a]` is the restart that axis a took; `log_sd[name]` `(axes, components)` is the Laplace SD of the
+    logarithm of each hyperparameter, NaN where it is fixed; `interrupted` where the user stopped it.
+    """
+
+    restarts: tuple[RestartReport, ...]
+    best: tuple[int, ...]
+    log_likelihood: tuple[float, ...]
+    objective: tuple[float, ...]
+    log_sd: dict[str, list[list[float]]]
+    interrupted: bool
+    samples: int
+
+
+#: Called as progress(restart, iteration, objective summed over axes).
+Progress = Callable[[int, int, float], None]
+
+
+def observations(model: ForceModel, features: Features) -> Observations:
+    """Force less its prior mean, with noise, of a log that has force."""
+    assert features.force is not None
+    residual = features.force - model.prior_mean(features.inputs)
+    return Observations(features.inputs, residual, model.noise_variance, features.valid)
+
+
+def objective(model: ForceModel, features: Features, jitter: float) -> tuple[Tensor, Tensor]:
+    """Log posterior density of the hyperparameters and log marginal likelihood, `(axes,)` each [nats]."""
+    likelihood = log_marginal_likelihood(model.kernel, observations(model, features), jitter).sum(-1)
+    return likelihood + model.log_prior(), likelihood
+
+
+def train(
+    model: ForceModel,
+    features: Features,
+    config: TrainingConfig,
+    jitter: float,
+    progress: Progress | None = None,
+) -> TrainingReport:
+    """Set the hyperparameters of `model` to their MAP estimate; deterministic under `config.seed`.
+
+    Interrupting (Ctrl-C) keeps the best found so far.
+
+    Raises:
+        NotPositiveDefiniteError: no restart found a covariance that factorises.
+    """
+    search = _Search(model, features, jitter)
+    generator = np.random.default_rng(config.seed)
+    reports: list[RestartReport] = []
+    interrupted = False
+    failure: NotPositiveDefiniteError | None = None
+    for restart in range(config.restarts):
+        start = search.start(generator if restart else None)
+        search.begin(restart, progress)
+        clock = time.perf_counter()
+        try:
+            result = minimize(
+                search,
+                start,
+                jac=True,
+                method="L-BFGS-B",
+                bounds=search.bounds,
+                callback=search.report,
+                options={"maxiter": config.max_iterations, "gtol": config.gradient_tolerance, "ftol": 1e-10},
+            )
+            outcome = str(result.message)
+        except NotPositiveDefiniteError as error:
+            failure, outcome = error, f"stopped: {error}"
+        except KeyboardInterrupt:
+            interrupted, outcome = True, "interrupted"
+        reports.append(search.summary(restart, outcome, time.perf_counter() - clock))
+        if interrupted:
+            break
+    if not np.isfinite(search.best_objective).all():
+        if failure is not None:
+            raise failure
+        raise KeyboardInterrupt
+    search.restore()
+    log_sd = _laplace(search) if not interrupted else {}
+    return TrainingReport(
+        restarts=tuple(reports),
+        best=tuple(int(r) for r in search.best_restart),
+        log_likelihood=tuple(float(v) for v in search.best_likelihood),
+        objective=tuple(float(v) for v in search.best_objective),
+        log_sd=log_sd,
+        interrupted=interrupted,
+        samples=sum(len(rows) for rows in features.rows),
+    )
+
+
+class _Search:
+    """The objective as scipy sees it: a function of one vector, the free unconstrained values by axis."""
+
+    def __init__(self, model: ForceModel, features: Features, jitter: float) -> None:
+        self.model, self.features, self.jitter = model, features, jitter
+        self.entries: list[Entry] = [entry for entry in model.entries if bool(entry.free.any())]
+        self.axes = features.inputs.shape[0]
+        free = [entry.free.numpy() for entry in self.entries]
+        self.free = np.concatenate(free) if free else np.zeros(0, dtype=bool)
+        self.bounds = self._bounds()
+        self.best_objective = np.full(self.axes, -np.inf)
+        self.best_likelihood = np.full(self.axes, -np.inf)
+        self.best_restart = np.zeros(self.axes, dtype=int)
+        self.best_point = self.pack()
+        self.begin(0, None)
+
+    def begin(self, restart: int, progress: Progress | None) -> None:
+        self.restart, self.progress = restart, progress
+        self.iterations = self.evaluations = 0
+        self.reached = np.full(self.axes, -np.inf)
+        self.reached_likelihood = np.full(self.axes, -np.inf)
+
+    def pack(self) -> Array:
+        """Free unconstrained values, `(axes, free)`."""
+        if not self.entries:
+            return np.zeros((self.axes, 0))
+        raw = [entry.raw.detach().reshape(self.axes, -1).numpy() for entry in self.entries]
+        return np.concatenate(raw, axis=1)[:, self.free].copy()
+
+    def unpack(self, point: Array) -> None:
+        """Write `(axes, free)` values into the model."""
+        if not self.entries:
+            return
+        full = np.concatenate(
+            [entry.raw.detach().reshape(self.axes, -1).numpy() for entry in self.entries], axis=1
+        ).copy()
+        full[:, self.free] = point.reshape(self.axes, -1)
+        column = 0
+        with torch.no_grad():
+            for entry in self.entries:
+                width = len(entry.specs)
+                entry.raw.copy_(torch.from_numpy(full[:, column : column + width]).reshape(entry.raw.shape))
+                column += width
+
+    def start(self, generator: np.random.Generator | None) -> Array:
+        """Hyperprior medians, or a draw from the hyperprior, inside the bounds."""
+        columns = []
+        for entry in self.entries:
+            deviation = np.zeros((self.axes, len(entry.specs)))
+            if generator is not None:
+                deviation = generator.standard_normal(deviation.shape)
+            values = entry.medians * torch.exp(entry.log_sds * torch.from_numpy(deviation))
+            raw = torch.stack([entry.inverse(row)[0].reshape(-1) for row in values])
+            columns.append(raw.numpy())
+        point = np.concatenate(columns, axis=1)[:, self.free].reshape(-1) if columns else np.zeros(0)
+        lower, upper = np.array(self.bounds).reshape(-1, 2).T
+        return np.asarray(np.clip(point, lower, upper))
+
+    def evaluate(self, point: Array) -> tuple[Array, Array, Array]:
+        """Objective and likelihood `(axes,)`, gradient of the objective `(axes, free)`."""
+        self.unpack(point)
+        raws = [entry.raw for entry in self.entries]
+        for raw in raws:
+            raw.grad = None
+        value, likelihood = objective(self.model, self.features, self.jitter)
+        if raws:
+            value.sum().backward()
+            # A hyperparameter that the data do not touch still has its hyperprior's gradient.
+            parts = [_gradient(raw).reshape(self.axes, -1).numpy() for raw in raws]
+            gradient = np.concatenate(parts, axis=1)[:, self.free]
+        else:
+            gradient = np.zeros((self.axes, 0))
+        return value.detach().numpy(), likelihood.detach().numpy(), gradient
+
+    def __call__(self, point: Array) -> tuple[float, Array]:
+        value, likelihood, gradient = self.evaluate(point)
+        self.evaluations += 1
+        better = value > self.reached
+        self.reached = np.where(better, value, self.reached)
+        self.reached_likelihood = np.where(better, likelihood, self.reached_likelihood)
+        best = value > self.best_objective
+        self.best_objective = np.where(best, value, self.best_objective)
+        self.best_likelihood = np.where(best, likelihood, self.best_likelihood)
+        self.best_restart = np.where(best, self.restart, self.best_restart)
+        self.best_point = np.where(best[:, None], point.reshape(self.axes, -1), self.best_point)
+        return -float(value.sum()), -gradient.reshape(-1)
+
+    def report(self, _: Array) -> None:
+        self.iterations += 1
+        if self.progress is not None:
+            self.progress(self.restart, self.iterations, float(self.reached.sum()))
+
+    def summary(self, restart: int, outcome: str, seconds: float) -> RestartReport:
+        return RestartReport(
+            restart, tuple(self.reached.tolist()), tuple(self.reached_likelihood.tolist()),
+            self.iterations, self.evaluations, seconds, outcome,
+        )  # fmt: skip
+
+    def restore(self) -> None:
+        self.unpack(self.best_point)
+
+    def _bounds(self) -> list[tuple[float, float]]:
+        one_axis: list[tuple[float, float]] = []
+        for entry in self.entries:
+            bounded = bool(torch.isfinite(entry.constraint.upper_bound).all())
+            for spec in entry.specs:
+                if spec.fixed:
+                    continue
+                if bounded:
+                    one_axis.append((-INTERVAL_BOUND, INTERVAL_BOUND))
+                else:
+                    centre, width = np.log(spec.median) / entry.power, BOUND * spec.log_sd / entry.power
+                    one_axis.append((centre - width, centre + width))
+        return one_axis * self.axes
+
+
+def _gradient(raw: torch.nn.Parameter) -> Tensor:
+    return torch.zeros_like(raw) if raw.grad is None else raw.grad
+
+
+def _laplace(search: _Search) -> dict[str, list[list[float]]]:
+    """SD of log h from the curvature at the optimum: central differences of the gradient, all axes at once."""
+    point = search.best_point
+    size = point.shape[1]
+    hessian = np.zeros((search.axes, size, size))
+    for column in range(size):
+        step = np.zeros_like(point)
+        step[:, column] = HESSIAN_STEP
+        try:
+            above, below = search.evaluate(point + step)[2], search.evaluate(point - step)[2]
+        except NotPositiveDefiniteError:
+            above = below = np.full_like(point, np.nan)
+        hessian[:, column] = -(above - below) / (2.0 * HESSIAN_STEP)
+    search.restore()
+    hessian = 0.5 * (hessian + hessian.transpose(0, 2, 1))
+    raw_sd = np.array([_standard_deviations(h) for h in hessian]).reshape(search.axes, size)
+    spread = np.full((search.axes, search.free.size), np.nan)
+    spread[:, search.free] = raw_sd
+    result: dict[str, list[list[float]]] = {}
+    column = 0
+    for entry in search.entries:
+        width = len(entry.specs)
+        # d log h / d raw: `power` for a logarithmic constraint, less inside an interval.
+        raw = entry.raw.detach().clone().requires_grad_()
+        log_value = entry.power * entry.constraint.transform(raw).log()
+        (slope,) = torch.autograd.grad(log_value.sum(), raw)
+        scaled = spread[:, column : column + width] * slope.reshape(search.axes, -1).numpy()
+        result[entry.name] = scaled.tolist()
+        column += width
+    return result
+
+
+def _standard_deviations(hessian: Array) -> Array:
+    """√diag(H⁻¹); NaN where the optimum is no proper maximum (at a bound, say)."""
+    if not np.isfinite(hessian).all():
+        return np.full(len(hessian), np.nan)
+    values, vectors = np.linalg.eigh(hessian)
+    if (values <= 0).any():
+        return np.full(len(hessian), np.nan)
+    return np.asarray(np.sqrt(np.square(vectors) @ (1.0 / values)))
