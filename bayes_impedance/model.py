@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import torch
 
 from bayes_impedance.config import Config, load_config
@@ -207,8 +206,3 @@ class ImpedanceModel:
         for group in log.groups:
             n = sum(len(trial.time) for trial in log.trials if trial.group == group)
             check_capacity(n, self.config.engine.max_samples, f"group '{group}'")
-
-
-def concatenated_force(log: PreparedLog) -> np.ndarray:
-    """Force of every sample, `(samples, axes)` [N]; the log must have force."""
-    return np.concatenate([trial.force for trial in log.trials if trial.force is not None])

@@ -292,7 +292,8 @@ class _SavitzkyGolay:
 def _filter(trial: Trial, smoother: Smoother, step: float) -> _SavitzkyGolay:
     # The odd number nearest to window / step.
     length = 2 * math.floor(smoother.window / step / 2 + 1e-9) + 1
-    if length <= smoother.polynomial_order:
+    # With order + 1 samples the polynomial passes through every one of them and smooths nothing.
+    if length <= smoother.polynomial_order + 1:
         length = smoother.polynomial_order + 2
         length += 1 - length % 2
         warnings.warn(

@@ -1,0 +1,61 @@
+"""The naive GP: a squared exponential over the same inputs, with nothing known of arms."""
+
+from __future__ import annotations
+
+from bayes_impedance.config import Config, DesiredTrajectoryPrior, ResidualPrior
+from bayes_impedance.errors import LogError
+from bayes_impedance.features import FeatureMap, baseline_components, label_trials
+from bayes_impedance.kernels.impedance import Latent
+from bayes_impedance.posterior import Posterior, compute_posterior
+from bayes_impedance.preprocessing import PreparedLog
+from bayes_impedance.priors import ForceModel, build_naive_model
+from bayes_impedance.training import Progress, TrainingReport, train
+from bayes_impedance.trajectory_mean import TrajectoryMean
+
+
+class NaiveModel:
+    """u ~ GP(0, SE(ξ)) + noise, one function a group, trained with the same care as the impedance model.
+
+    Hyperpriors are those of the impedance model's residual and noise; optimiser and restarts are the same.
+    """
+
+    def __init__(self, config: Config, log: PreparedLog, progress: Progress | None = None) -> None:
+        self._config = naive_config(config)
+        self._log = log
+        self._map = FeatureMap(self._config, log.axes)
+        features = self._map(log, self._mean(log))
+        if features.force is None:
+            raise LogError("expected a log with force to train on, found none; name log.columns.force")
+        self._model: ForceModel = build_naive_model(self._config, self._map)
+        self.report: TrainingReport = train(
+            self._model, features, config.training, config.engine.jitter, progress
+        )
+
+    def predict(self, log: PreparedLog) -> Posterior:
+        """Force of `log` given the training forces; only the marginal of `Latent.FORCE`."""
+        labels = label_trials(self._log, log)
+        return compute_posterior(
+            self._model,
+            log,
+            self._map(log, self._mean(log), labels),
+            self._map(self._log, self._mean(self._log), labels),
+            self._config.engine.jitter,
+            [Latent.FORCE],
+        )
+
+    def _mean(self, log: PreparedLog) -> TrajectoryMean:
+        return TrajectoryMean.from_training(self._config.model.desired_trajectory, log)
+
+
+def naive_config(config: Config) -> Config:
+    """`config` with the baseline's inputs as those of the residual, and no prior mean."""
+    residual = config.model.residual or ResidualPrior()
+    components = baseline_components(config)
+    model = config.model.model_copy(
+        update={
+            "desired_trajectory": DesiredTrajectoryPrior(mean="equilibrium"),
+            "residual": residual.model_copy(update={"input": components, "offset_sd": None}),
+        }
+    )
+    baseline = config.baseline.model_copy(update={"input": components})
+    return config.model_copy(update={"model": model, "baseline": baseline})

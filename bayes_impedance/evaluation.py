@@ -1,0 +1,69 @@
+"""Scores of a trained model on logs it has not seen, beside a naive GP."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+
+from bayes_impedance.baselines.naive import NaiveModel
+from bayes_impedance.errors import LogError, LogWarning
+from bayes_impedance.features import trial_key
+from bayes_impedance.kernels.impedance import Latent
+from bayes_impedance.log import InteractionLog
+from bayes_impedance.metrics import Scores, score
+from bayes_impedance.model import ImpedanceModel
+from bayes_impedance.posterior import Posterior
+from bayes_impedance.preprocessing import PreparedLog
+from bayes_impedance.training import Progress
+
+#: axis → name of the model → scores
+Evaluation = dict[str, dict[str, Scores]]
+
+
+def evaluate(
+    model: ImpedanceModel,
+    log: InteractionLog | PreparedLog,
+    naive: bool = False,
+    progress: Progress | None = None,
+) -> Evaluation:
+    """Score the force of `log` predicted from the training forces alone; optionally train a naive GP beside.
+
+    Raises:
+        LogError: the log has no force.
+    """
+    prepared = model.prepare(log)
+    if any(trial.force is None for trial in prepared.trials):
+        raise LogError("expected a log with force to score against, found none; name log.columns.force")
+    training = model.fitted.log
+    seen = {trial_key(trial) for trial in training.trials}
+    if any(trial_key(trial) in seen for trial in prepared.trials):
+        warnings.warn(
+            "some of these trials were trained on, so their scores tell how well they are remembered, not predicted",
+            LogWarning,
+            stacklevel=2,
+        )
+    predictions = {"impedance": model.posterior(prepared, given="training", latents=[Latent.FORCE])}
+    if naive:
+        predictions["naive"] = NaiveModel(model.config, training, progress).predict(prepared)
+    return {
+        axis: {name: _scores(posterior, training, a) for name, posterior in predictions.items()}
+        for a, axis in enumerate(prepared.axes)
+    }
+
+
+def as_json(evaluation: Evaluation) -> dict[str, object]:
+    """The JSON that `evaluate --json` writes."""
+    return {
+        "axes": {
+            axis: {name: scores.as_dict() for name, scores in models.items()}
+            for axis, models in evaluation.items()
+        }
+    }
+
+
+def _scores(posterior: Posterior, training: PreparedLog, axis: int) -> Scores:
+    marginal = posterior[Latent.FORCE]
+    force = np.concatenate([trial.force[:, axis] for trial in posterior.log.trials if trial.force is not None])
+    trained = np.concatenate([trial.force[:, axis] for trial in training.trials if trial.force is not None])
+    return score(marginal.mean[:, axis], marginal.sd[:, axis], force, trained)

@@ -1,0 +1,104 @@
+"""Writing files and folders whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from bayes_impedance.errors import OutputError
+
+
+def check_writable(path: Path) -> None:
+    """Refuse a place where nothing can be written, before hours of work are lost to it.
+
+    Raises:
+        OutputError: the parent folder is missing, or not writable.
+    """
+    parent = path.absolute().parent
+    if not parent.is_dir():
+        raise OutputError(f"{path}: expected an existing folder {parent} to write into, found none; create it")
+    try:
+        with tempfile.TemporaryFile(dir=parent):
+            pass
+    except OSError as error:
+        raise OutputError(
+            f"{path}: expected a writable folder {parent}, got: {error.strerror}; choose another place"
+        ) from error
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A temporary file beside `path` that replaces it when the block ends well, else vanishes.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    check_writable(path)
+    if path.is_dir():
+        raise OutputError(f"{path}: expected a file name to write to, found a folder; name a file in it")
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.absolute().parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        temporary.chmod(0o666 & ~_umask())
+        temporary.replace(path)
+    except OSError as error:
+        raise OutputError(f"{path}: could not be written: {error.strerror or error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_folder(path: Path, marker: str) -> Iterator[Path]:
+    """A temporary folder beside `path` that takes its place when the block ends well, else vanishes.
+
+    An existing folder is replaced only if it holds `marker`, the file that shows it to be of the same kind.
+
+    Raises:
+        OutputError: the folder cannot be written, or something else stands in its place.
+    """
+    check_writable(path)
+    check_replaceable(path, marker)
+    target = path.absolute()
+    temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
+    replaced = temporary.with_name(f"{temporary.name}.old")
+    try:
+        yield temporary
+        temporary.chmod(0o777 & ~_umask())
+        if target.is_dir():
+            target.rename(replaced)
+        temporary.rename(target)
+    except OSError as error:
+        # The old folder goes back to its place: nothing is lost.
+        if replaced.is_dir() and not target.exists():
+            replaced.rename(target)
+        raise OutputError(f"{path}: could not be written: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+        shutil.rmtree(replaced, ignore_errors=True)
+
+
+def check_replaceable(path: Path, marker: str) -> None:
+    """Refuse to replace what is not a folder of the same kind.
+
+    Raises:
+        OutputError: `path` is a file, or a folder with other content.
+    """
+    if path.is_file():
+        raise OutputError(f"{path}: expected a new folder name, found a file; choose another name")
+    if path.is_dir() and any(path.iterdir()) and not (path / marker).is_file():
+        raise OutputError(
+            f"{path}: expected a new folder, or one written by this command before, found a folder with other "
+            "content; choose another name"
+        )
+
+
+def _umask() -> int:
+    current = os.umask(0)
+    os.umask(current)
+    return current

@@ -1,0 +1,136 @@
+"""A trained model as a folder: YAML, JSON and safetensors, no pickle; loading gives the same bits.
+
+    config.yaml                   the whole configuration
+    hyperparameters.safetensors   unconstrained hyperparameters, by name
+    data.safetensors              the prepared training log
+    metadata.json                 schema and package version, training report, fingerprints
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+
+from bayes_impedance.config import dump_config, load_config
+from bayes_impedance.errors import BayesImpedanceError, ModelFolderError
+from bayes_impedance.features import FeatureMap
+from bayes_impedance.model import Fit, ImpedanceModel
+from bayes_impedance.outputs import whole_folder
+from bayes_impedance.preprocessing import PreparedLog
+from bayes_impedance.priors import build_force_model
+from bayes_impedance.training import RestartReport, TrainingReport
+
+SCHEMA_VERSION = 1
+METADATA = "metadata.json"
+FILES = ("config.yaml", "hyperparameters.safetensors", "data.safetensors")
+
+
+def save_model(model: ImpedanceModel, folder: str | Path) -> None:
+    """Write a fitted model to `folder`, whole or not at all; a model that was there is replaced.
+
+    Raises:
+        OutputError: the folder cannot be written.
+        ConfigurationError: the model is not fitted.
+    """
+    fit = model.fitted
+    with whole_folder(Path(folder), METADATA) as place:
+        (place / "config.yaml").write_text(dump_config(model.config), encoding="utf-8")
+        tensors = {entry.name: entry.raw.detach().numpy() for entry in fit.force_model.entries}
+        save_file(tensors, place / "hyperparameters.safetensors")
+        save_file({k: np.ascontiguousarray(v) for k, v in fit.log.arrays().items()}, place / "data.safetensors")
+        metadata = {
+            "schema_version": SCHEMA_VERSION,
+            "package_version": version("bayes-impedance"),
+            "log": fit.log.header(),
+            "data_fingerprint": fit.log.fingerprint(),
+            "report": asdict(fit.report),
+            "files": {name: _digest(place / name) for name in FILES},
+        }
+        (place / METADATA).write_text(json.dumps(metadata, indent=2) + "\n", encoding="utf-8")
+
+
+def load_model(folder: str | Path) -> ImpedanceModel:
+    """The model that `save_model` wrote, predicting the same to the last bit.
+
+    Raises:
+        ModelFolderError: the folder is missing, incomplete, changed, or of a newer schema.
+    """
+    place = Path(folder)
+    metadata = _metadata(place)
+    for name in FILES:
+        if not (place / name).is_file():
+            raise ModelFolderError(
+                f"{place}: expected the files {', '.join(FILES)}, found no {name}; copy the whole folder again, "
+                "or train again"
+            )
+        if _digest(place / name) != metadata["files"].get(name):
+            raise ModelFolderError(
+                f"{place / name}: expected the content that training wrote, found it changed; restore it, or train "
+                "again (settings are changed with train --config or --set)"
+            )
+    try:
+        return _assemble(place, metadata)
+    except (KeyError, TypeError, ValueError, SafetensorError, BayesImpedanceError) as error:
+        raise ModelFolderError(
+            f"{place}: expected a model folder of schema {SCHEMA_VERSION}, found inconsistent content "
+            f"({error}); train again"
+        ) from error
+
+
+def _assemble(place: Path, metadata: Mapping[str, Any]) -> ImpedanceModel:
+    config = load_config(place / "config.yaml")
+    log = PreparedLog.from_arrays(metadata["log"], load_file(place / "data.safetensors"))
+    force_model = build_force_model(config, FeatureMap(config, log.axes))
+    tensors = load_file(place / "hyperparameters.safetensors")
+    for entry in force_model.entries:
+        with torch.no_grad():
+            entry.raw.copy_(torch.from_numpy(tensors[entry.name]))
+    report = dict(metadata["report"])
+    restarts = tuple(
+        RestartReport(**{**item, **{k: tuple(item[k]) for k in ("objective", "log_likelihood")}})
+        for item in report.pop("restarts")
+    )
+    lists = {key: tuple(report.pop(key)) for key in ("best", "log_likelihood", "objective")}
+    return ImpedanceModel(config, Fit(force_model, log, TrainingReport(restarts=restarts, **lists, **report)))
+
+
+def _metadata(place: Path) -> dict[str, Any]:
+    if not place.is_dir():
+        raise ModelFolderError(
+            f"{place}: expected a model folder, found {'a file' if place.exists() else 'nothing'}; name the folder "
+            "that `bayes-impedance train --out` wrote"
+        )
+    if not (place / METADATA).is_file():
+        raise ModelFolderError(
+            f"{place}: expected a model folder with {METADATA}, found none; name the folder that "
+            "`bayes-impedance train --out` wrote"
+        )
+    try:
+        metadata = json.loads((place / METADATA).read_text(encoding="utf-8"))
+        schema = int(metadata["schema_version"])
+        files = dict(metadata["files"])
+    except (OSError, UnicodeDecodeError, ValueError, KeyError, TypeError) as error:
+        raise ModelFolderError(
+            f"{place / METADATA}: expected the JSON that training wrote, found it truncated or changed ({error}); "
+            "copy the whole folder again, or train again"
+        ) from error
+    if schema > SCHEMA_VERSION:
+        raise ModelFolderError(
+            f"{place}: expected a model of schema {SCHEMA_VERSION} or older, found schema {schema}, written by "
+            f"bayes_impedance {metadata.get('package_version', 'of unknown version')}; update bayes_impedance"
+        )
+    return {**metadata, "files": files}
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
