@@ -314,7 +314,7 @@ class TrainingConfig(Section):
     restarts: int = Field(default=3, ge=1, le=100)
     seed: int = Field(default=0, ge=0)
     max_iterations: int = Field(default=200, ge=1)
-    gradient_tolerance: float = Field(default=1e-4, gt=0)
+    gradient_tolerance: float = Field(default=1e-3, gt=0)
 
 
 class BaselineConfig(Section):

@@ -85,24 +85,33 @@ def _sentence(
     name = f"{latent.value} {axis}{axis}"
     if np.isclose(posterior[latent].prior_scale[:, posterior.axes.index(axis)], 0.0).all():
         return f"{name}: fixed by the configuration, so the data had no say."
-    share = f"the data removed {max(contraction, 0.0):.0%} of the prior variance"
-    mean = config.model.desired_trajectory.mean
-    if support is Support.PRIOR_ONLY:
-        if mean == "equilibrium":
-            reason = (
-                "with the equilibrium mean the force only tells the product of impedance and the desired "
-                "trajectory's SD"
-            )
-        else:
-            reason = "perturb the motion, repeat it, or give a reference"
-        return f"{name}: prior only; {share}: {reason}."
-    caveat = ""
-    if mean != "reference" and all(trial.perturbation is None for trial in posterior.log.trials):
-        caveat = (
-            ", provided that something other than this person perturbed the motion (no perturbation column is in "
-            "the log; without one the robot's own law can look like an arm)"
+    share = f"the data removed {_percentage(contraction)} of the prior variance"
+    if support is not Support.PRIOR_ONLY:
+        return f"{name}: {support.value}; {share}."
+    if config.model.desired_trajectory.mean == "equilibrium":
+        reason = (
+            "with the equilibrium mean the force only tells the product of impedance and the desired trajectory's SD"
         )
-    return f"{name}: {support.value}; {share}{caveat}."
+    else:
+        reason = "perturb the motion, repeat it, or give a reference"
+    return f"{name}: prior only; {share}: {reason}."
+
+
+def caveat(verdicts: Iterable[Verdict], posterior: Posterior, config: Config) -> str | None:
+    """What every claim above presupposes, where the log itself cannot show it; None where nothing is claimed."""
+    claims = any(verdict.support is not Support.PRIOR_ONLY for verdict in verdicts)
+    known = config.model.desired_trajectory.mean in ("reference", "equilibrium")
+    if not claims or known or all(trial.perturbation is not None for trial in posterior.log.trials):
+        return None
+    return (
+        "These verdicts presume that something other than this person displaced the hand: the log has no "
+        "perturbation column, and without perturbation the robot's own law can look like an arm."
+    )
+
+
+def _percentage(contraction: float) -> str:
+    """A share that never claims to be all of it."""
+    return "over 99 %" if contraction > 0.99 else f"{max(contraction, 0.0):.0%}".replace("%", " %")
 
 
 def summarise(verdicts: Iterable[Verdict]) -> dict[str, dict[str, float | str]]:

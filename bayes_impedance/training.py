@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 BOUND = 6.0
 #: Unconstrained range of a hyperparameter that lives in an interval (a sigmoid).
 INTERVAL_BOUND = 8.0
+#: Relative improvement at which a restart has converged: some 1e-6 nats of a thousand.
+RELATIVE_TOLERANCE = 1e-9
 HESSIAN_STEP = 1e-3
 
 
@@ -110,7 +112,7 @@ def train(
                 method="L-BFGS-B",
                 bounds=search.bounds,
                 callback=search.report,
-                options={"maxiter": config.max_iterations, "gtol": config.gradient_tolerance, "ftol": 1e-10},
+                options={"maxiter": config.max_iterations, "gtol": config.gradient_tolerance, "ftol": RELATIVE_TOLERANCE},
             )
             outcome = str(result.message)
         except NotPositiveDefiniteError as error:

@@ -108,16 +108,15 @@ def force_covariance(
     for j in orders:
         column = expectation1[0] * table[0][j]
         for i in orders[1:]:
-            column = column + expectation1[i] * table[i][j]
-        term = column * expectation2[j]
-        total = term if total is None else total + term
+            column = torch.addcmul(column, expectation1[i], table[i][j])
+        total = column * expectation2[j] if total is None else torch.addcmul(total, column, expectation2[j])
     assert total is not None
     for (i, j), c in covariance.items():
-        total = total + c * table[i][j]
+        total = torch.addcmul(total, c, table[i][j])
     total = total * common
     if error1 is not None and error2 is not None:
         for (i, j), c in covariance.items():
-            total = total + c * (error1[i] * error2[j])
+            total = torch.addcmul(total, c, error1[i] * error2[j])
     return total
 
 

@@ -1,0 +1,254 @@
+"""The command line: demo, train, infer, evaluate, show."""
+
+from __future__ import annotations
+
+import json
+import sys
+import warnings
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from bayes_impedance import terminal
+from bayes_impedance.config import load_config, shipped_configurations
+from bayes_impedance.demo import prepare_folder, record, truth_errors
+from bayes_impedance.errors import BayesImpedanceError, LogWarning, OutputError
+from bayes_impedance.evaluation import as_json, evaluate
+from bayes_impedance.identifiability import summarise
+from bayes_impedance.model import ImpedanceModel
+from bayes_impedance.outputs import check_replaceable, check_writable, whole_file
+from bayes_impedance.persistence import METADATA, load_model, save_model
+from bayes_impedance.plotting import save_figures
+from bayes_impedance.posterior import Posterior
+from bayes_impedance.readers import read_log
+
+BAD_INPUT, INTERRUPTED = 2, 130
+
+app = typer.Typer(
+    name="bayes-impedance",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    help=(
+        "Infer what a person's arm is (mass, damping, stiffness) and where the person wants to go (the desired "
+        "trajectory) from logged motion and interaction force, with uncertainty.\n\n"
+        "A first round: [bold]bayes-impedance demo[/bold]. On your own log: [bold]train LOG --config phase --out "
+        "MODEL[/bold], then [bold]infer MODEL LOG --out POSTERIOR.csv --figures FIGURES[/bold], [bold]evaluate MODEL "
+        "OTHER_LOG --baseline naive[/bold], [bold]show MODEL[/bold]."
+    ),
+)
+
+Model = Annotated[Path, typer.Argument(help="Folder that train wrote.", show_default=False)]
+Logs = Annotated[
+    list[Path], typer.Argument(help="Recordings: .csv, .tsv, .txt or .parquet; several may follow.", show_default=False)
+]
+
+
+class Given(str, Enum):
+    """Forces that infer conditions on."""
+
+    both = "both"
+    training = "training"
+    log = "log"
+
+
+class Baseline(str, Enum):
+    """Competitors of evaluate."""
+
+    naive = "naive"
+
+
+def main() -> None:
+    """Entry point: bad input ends in one sentence and exit code 2, never in a traceback."""
+    warnings.showwarning = _show_warning
+    try:
+        app()
+    except BayesImpedanceError as error:
+        _errors().print(f"[bold red]error:[/bold red] {escape(str(error))}", highlight=False, soft_wrap=True)
+        sys.exit(BAD_INPUT)
+    except KeyboardInterrupt:
+        _errors().print("interrupted; nothing was written")
+        sys.exit(INTERRUPTED)
+
+
+@app.callback(invoke_without_command=True)
+def _version(version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False) -> None:
+    if version:
+        from importlib.metadata import version as installed
+
+        typer.echo(installed("bayes-impedance"))
+        raise typer.Exit
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for logs, model, posterior and figures.")] = Path("demo"),
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulated experiment.")] = 0,
+) -> None:
+    """Do the main job on a simulated experiment whose truth is known: train, infer, evaluate, draw.
+
+    Five perturbed repetitions of a figure of eight are drawn from the generative model; four train, the fifth tests.
+    """
+    console = Console()
+    prepare_folder(out)
+    recording = record(out, seed)
+    console.print(f"wrote {recording.training} (4 repetitions) and {recording.testing} (a fifth), truth included")
+    model = ImpedanceModel(recording.config)
+    with terminal.training_progress(console, recording.config.training, "training") as progress:
+        model = model.fit(read_log(recording.training, recording.config.log), progress)
+    save_model(model, out / "model")
+    posterior = model.posterior(model.fitted.log)
+    verdicts = terminal.print_verdicts(console, model, posterior)
+    errors = truth_errors(lambda name: posterior[name].mean, model.fitted.log)
+    listed = ", ".join(f"{name} {error:.1%}" for name, error in errors.items())
+    console.print(f"Mean relative error against the truth: {listed}", highlight=False)
+    with terminal.training_progress(console, recording.config.training, "naive GP") as progress:
+        scores = evaluate(model, read_log(recording.testing, recording.config.log), naive=True, progress=progress)
+    console.print(terminal.evaluation_table(scores))
+    _write_posterior(posterior, out / "posterior.csv")
+    figures = save_figures(posterior, verdicts, out)
+    for path in (out / "model", out / "posterior.csv", *figures):
+        console.print(f"wrote {path}")
+
+
+@app.command()
+def train(
+    logs: Logs,
+    config: Annotated[
+        str,
+        typer.Option(help=f"YAML file, or a shipped configuration: {', '.join(shipped_configurations())}."),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the model; one that train wrote before is replaced.")],
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Change one key, e.g. training.restarts=5; repeatable."),
+    ] = None,
+) -> None:
+    """Train hyperparameters on recordings (MAP of the marginal likelihood) and write the model.
+
+    Ctrl-C stops early and keeps the best found so far.
+    """
+    console = Console()
+    settings = load_config(config, overrides or [])
+    check_writable(out)
+    check_replaceable(out, METADATA)
+    log = read_log(logs, settings.log)
+    model = ImpedanceModel(settings)
+    prepared = model.prepare(log)
+    console.print(
+        f"training on {prepared.n_samples} samples of {len(prepared.trials)} trials, axes {', '.join(prepared.axes)}"
+    )
+    with terminal.training_progress(console, settings.training, "training") as progress:
+        model = model.fit(prepared, progress)
+    save_model(model, out)
+    console.print(terminal.restart_table(model))
+    terminal.print_verdicts(console, model, model.posterior(model.fitted.log))
+    console.print(f"wrote {out}; look at it with: bayes-impedance show {out}", highlight=False, soft_wrap=True)
+    if model.report.interrupted:
+        console.print("training was interrupted: the model holds the best hyperparameters found until then")
+        raise typer.Exit(INTERRUPTED)
+
+
+@app.command()
+def infer(
+    model: Model,
+    logs: Logs,
+    out: Annotated[Path, typer.Option(help="Table to write: .csv or .parquet.")],
+    given: Annotated[
+        Given, typer.Option(help="Forces to condition on: those trained on, those of LOG, or both.")
+    ] = Given.both,
+    figures: Annotated[Path | None, typer.Option(help="Folder for PNG figures.")] = None,
+) -> None:
+    """Infer force, desired trajectory, stiffness, damping and mass at every sample of LOG.
+
+    Columns are <quantity>_<axis>_{mean,sd,q05,q95} in SI units. Without force in LOG nothing of it is conditioned on.
+    """
+    console = Console()
+    _posterior_format(out)
+    check_writable(out)
+    trained = load_model(model)
+    log = read_log(logs, trained.config.log, require_force=given is not Given.training and given is not Given.both)
+    posterior = trained.posterior(log, given.value)
+    _write_posterior(posterior, out)
+    verdicts = terminal.print_verdicts(console, trained, posterior)
+    console.print(f"wrote {out}", highlight=False, soft_wrap=True)
+    if figures is not None:
+        prepare_folder(figures)
+        for path in save_figures(posterior, verdicts, figures):
+            console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+
+
+@app.command(name="evaluate")
+def evaluate_command(
+    model: Model,
+    logs: Logs,
+    baseline: Annotated[Baseline | None, typer.Option(help="Competitor trained on the same data.")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the scores to this file.")] = None,
+) -> None:
+    """Score predicted force on LOG, given the training forces only: SMSE, MSLL, NLPD, coverage of the 90 % band."""
+    console = Console()
+    if json_file is not None:
+        check_writable(json_file)
+    trained = load_model(model)
+    log = read_log(logs, trained.config.log)
+    with terminal.training_progress(console, trained.config.training, "naive GP") as progress:
+        scores = evaluate(trained, log, naive=baseline is Baseline.naive, progress=progress)
+    console.print(terminal.evaluation_table(scores))
+    if json_file is not None:
+        with whole_file(json_file) as temporary:
+            temporary.write_text(json.dumps(as_json(scores), indent=2) + "\n", encoding="utf-8")
+        console.print(f"wrote {json_file}", highlight=False, soft_wrap=True)
+
+
+@app.command()
+def show(
+    model: Model,
+    json_output: Annotated[bool, typer.Option("--json", help="Print estimates and verdicts as JSON.")] = False,
+) -> None:
+    """Show hyperparameters in SI units, prior against posterior, the verdict on impedance, and what trained them."""
+    console = Console()
+    trained = load_model(model)
+    posterior = trained.posterior(trained.fitted.log)
+    if json_output:
+        typer.echo(json.dumps(summarise(trained.verdicts(posterior)), indent=2))
+        return
+    log, report = trained.fitted.log, trained.report
+    sources = ", ".join(dict.fromkeys(trial.source for trial in log.trials))
+    console.print(
+        f"trained on {sources}: {report.samples} samples, {len(log.trials)} trials, groups {', '.join(log.groups)}, "
+        f"axes {', '.join(log.axes)}{'; interrupted' if report.interrupted else ''}",
+        highlight=False, soft_wrap=True,
+    )  # fmt: skip
+    console.print(terminal.hyperparameter_table(trained))
+    console.print(terminal.restart_table(trained))
+    terminal.print_verdicts(console, trained, posterior)
+
+
+def _posterior_format(path: Path) -> str:
+    if path.suffix not in (".csv", ".parquet"):
+        raise OutputError(f"{path}: expected a file name ending in .csv or .parquet, got '{path.suffix}'; rename it")
+    return path.suffix
+
+
+def _write_posterior(posterior: Posterior, path: Path) -> None:
+    suffix = _posterior_format(path)
+    table = posterior.table()
+    with whole_file(path) as temporary:
+        if suffix == ".csv":
+            table.to_csv(temporary, index=False)
+        else:
+            table.to_parquet(temporary, index=False)
+
+
+def _errors() -> Console:
+    return Console(stderr=True)
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
+    """Our warnings in one sentence; those of libraries are no news to the user."""
+    if issubclass(category, LogWarning):
+        _errors().print(f"[yellow]warning:[/yellow] {escape(str(message))}", highlight=False, soft_wrap=True)

@@ -1,0 +1,146 @@
+"""Figures: force against prediction, desired against actual trajectory, impedance prior and posterior.
+
+Each function returns a matplotlib figure and shows nothing by itself. Every impedance curve carries its
+verdict, so that no stiffness is looked at without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from bayes_impedance.identifiability import Verdict
+from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
+from bayes_impedance.outputs import whole_file
+from bayes_impedance.posterior import UNITS, Marginal, Posterior
+
+Array = NDArray[np.float64]
+
+POSTERIOR, PRIOR, MEASURED, TRUTH = "#0b6e99", "#9aa5ab", "#1a1a1a", "#c2410c"
+SYMBOLS = {Latent.STIFFNESS: "k", Latent.DAMPING: "d", Latent.MASS: "m"}
+
+
+def plot_force(posterior: Posterior, trials: Sequence[int] | None = None) -> Figure:
+    """Measured force and the posterior of a new measurement with its 90 % band, an axis a row, a trial a column."""
+    chosen = _chosen(posterior, trials)
+    figure, grid = _grid(len(posterior.axes), len(chosen), sharex="col", sharey="row")
+    marginal = posterior[Latent.FORCE]
+    for column, index in enumerate(chosen):
+        trial, rows = posterior.log.trials[index], posterior.trial_slice(index)
+        for a, axis in enumerate(posterior.axes):
+            ax = grid[a][column]
+            _band(ax, trial.time, marginal, rows, a, "new measurement")
+            if trial.force is not None:
+                ax.plot(trial.time, trial.force[:, a], ".", ms=2.5, color=MEASURED, label="measured")
+            _label(ax, column, a, len(posterior.axes), f"force {axis} [N]", "time [s]")
+        grid[0][column].set_title(f"trial {trial.name}", fontsize=9)
+    return _finished(figure, grid, "Interaction force")
+
+
+def plot_desired_trajectory(posterior: Posterior, trials: Sequence[int] | None = None) -> Figure:
+    """Hand and desired position with its 90 % band, an axis a row, a trial a column."""
+    chosen = _chosen(posterior, trials)
+    figure, grid = _grid(len(posterior.axes), len(chosen), sharex="col", sharey="row")
+    marginal = posterior[Latent.DESIRED_POSITION]
+    for column, index in enumerate(chosen):
+        trial, rows = posterior.log.trials[index], posterior.trial_slice(index)
+        for a, axis in enumerate(posterior.axes):
+            ax = grid[a][column]
+            _band(ax, trial.time, marginal, rows, a, "desired")
+            ax.plot(trial.time, trial.position[:, a], color=MEASURED, lw=1.0, label="hand")
+            truth = trial.truth.get(f"desired_position_{axis}")
+            if truth is not None:
+                ax.plot(trial.time, truth, "--", color=TRUTH, lw=1.0, label="true desired")
+            _label(ax, column, a, len(posterior.axes), f"position {axis} [m]", "time [s]")
+        grid[0][column].set_title(f"trial {trial.name}", fontsize=9)
+    return _finished(figure, grid, "Desired and actual trajectory")
+
+
+def plot_impedance(posterior: Posterior, verdicts: Iterable[Verdict], trial: int = 0) -> Figure:
+    """Stiffness, damping and mass along one trial: prior and posterior 90 % bands, with the verdict."""
+    figure, grid = _grid(len(IMPEDANCE_ORDER), len(posterior.axes), sharex="all", sharey="row", height=2.2)
+    said = {(verdict.latent, verdict.axis): verdict for verdict in verdicts}
+    record, rows = posterior.log.trials[trial], posterior.trial_slice(trial)
+    by_phase = record.phase is not None
+    abscissa = record.phase if record.phase is not None else record.time
+    order = np.argsort(abscissa)
+    for row, latent in enumerate(IMPEDANCE_ORDER):
+        marginal = posterior[latent]
+        for a, axis in enumerate(posterior.axes):
+            ax = grid[row][a]
+            low, high = (marginal.prior_quantile(p)[rows, a][order] for p in (0.05, 0.95))
+            ax.fill_between(abscissa[order], low, high, color=PRIOR, alpha=0.25, lw=0, label="prior, 90 %")
+            _band(ax, abscissa[order], marginal, np.arange(rows.start, rows.stop)[order], a, "posterior")
+            name = f"{latent.value}_{axis}{axis}"
+            if name in record.truth:
+                ax.plot(abscissa[order], record.truth[name][order], "--", color=TRUTH, lw=1.2, label="truth")
+            if marginal.warped:
+                ax.set_yscale("log")
+            verdict = said[latent, axis]
+            ax.set_title(f"{verdict.support.value} (contraction {verdict.contraction:.2f})", fontsize=8)
+            symbol = f"{SYMBOLS[latent]}$_{{{axis}{axis}}}$"
+            _label(ax, a, row, len(IMPEDANCE_ORDER), f"{latent.value} {symbol if a == 0 else ''} [{UNITS[latent]}]",
+                   "phase" if by_phase else "time [s]")  # fmt: skip
+    return _finished(figure, grid, f"Impedance along trial {record.name}, axes {', '.join(posterior.axes)}")
+
+
+def save_figures(
+    posterior: Posterior, verdicts: Sequence[Verdict], folder: Path, trials: Sequence[int] | None = None
+) -> list[Path]:
+    """Write `force.png`, `desired_trajectory.png` and `impedance.png` into `folder`.
+
+    Raises:
+        OutputError: the folder cannot be written.
+    """
+    figures = {
+        "force.png": plot_force(posterior, trials),
+        "desired_trajectory.png": plot_desired_trajectory(posterior, trials),
+        "impedance.png": plot_impedance(posterior, verdicts, _chosen(posterior, trials)[0]),
+    }
+    paths = []
+    for name, figure in figures.items():
+        with whole_file(folder / name) as temporary:
+            figure.savefig(temporary, dpi=130)
+        paths.append(folder / name)
+    return paths
+
+
+def _chosen(posterior: Posterior, trials: Sequence[int] | None) -> list[int]:
+    """Four trials at most: more no longer fit on a page."""
+    return list(range(len(posterior.log.trials)) if trials is None else trials)[:4]
+
+
+def _grid(rows: int, columns: int, sharex: str, sharey: str, height: float = 2.4) -> tuple[Figure, list[list[Axes]]]:
+    figure = Figure(figsize=(max(6.0, 3.2 * columns), 0.7 + height * rows), layout="constrained")
+    grid = figure.subplots(rows, columns, sharex=sharex, sharey=sharey, squeeze=False)  # type: ignore[arg-type]
+    return figure, [list(row) for row in grid]
+
+
+def _band(
+    ax: Axes, abscissa: Array, marginal: Marginal, rows: slice | NDArray[np.int64], axis: int, name: str
+) -> None:
+    middle = marginal.quantile(0.5)[rows, axis]
+    low, high = marginal.quantile(0.05)[rows, axis], marginal.quantile(0.95)[rows, axis]
+    ax.fill_between(abscissa, low, high, color=POSTERIOR, alpha=0.3, lw=0)
+    ax.plot(abscissa, middle, color=POSTERIOR, lw=1.2, label=f"{name}, 90 % band")
+
+
+def _label(ax: Axes, column: int, row: int, rows: int, ylabel: str, xlabel: str) -> None:
+    ax.tick_params(labelsize=8)
+    ax.grid(alpha=0.2)
+    if column == 0:
+        ax.set_ylabel(ylabel, fontsize=8)
+    if row == rows - 1:
+        ax.set_xlabel(xlabel, fontsize=8)
+
+
+def _finished(figure: Figure, grid: list[list[Axes]], title: str) -> Figure:
+    figure.suptitle(title, fontsize=11)
+    handles, labels = grid[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(handles), fontsize=8, frameon=False)
+    return figure

@@ -1,0 +1,131 @@
+"""What the commands print: tables and progress, for people, on a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from bayes_impedance.config import TrainingConfig
+from bayes_impedance.evaluation import Evaluation
+from bayes_impedance.identifiability import Support, Verdict, caveat
+from bayes_impedance.model import ImpedanceModel
+from bayes_impedance.posterior import Posterior
+from bayes_impedance.priors import Entry
+from bayes_impedance.training import Progress as ProgressHook
+
+COLOURS = {Support.SUPPORTED: "green", Support.WEAK: "yellow", Support.PRIOR_ONLY: "red"}
+
+
+@contextmanager
+def training_progress(console: Console, config: TrainingConfig, what: str) -> Iterator[ProgressHook]:
+    """A bar over restarts and iterations; hidden where the output is no terminal."""
+    total = config.restarts * config.max_iterations
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
+        task = bar.add_task(what, total=total, state="")
+
+        def hook(restart: int, iteration: int, objective: float) -> None:
+            state = f"restart {restart + 1}/{config.restarts}, iteration {iteration}, log posterior {objective:.2f}"
+            bar.update(task, completed=restart * config.max_iterations + iteration, state=state)
+
+        yield hook
+
+
+def verdict_table(verdicts: Sequence[Verdict]) -> Table:
+    """Path averages of stiffness, damping and mass, each beside its verdict."""
+    table = Table(title="Impedance, averaged over the samples", title_justify="left")
+    for name in ("", "mean", "90 % interval", "prior 90 %", "unit", "contraction", "verdict"):
+        table.add_column(name, justify="left" if name in ("", "unit", "verdict") else "right")
+    for v in verdicts:
+        colour = COLOURS[v.support]
+        table.add_row(
+            f"{v.latent.value} {v.axis}{v.axis}", f"{v.mean:.4g}", f"{v.q05:.4g} … {v.q95:.4g}",
+            f"{v.prior_q05:.3g} … {v.prior_q95:.3g}", v.unit, f"{v.contraction:.3f}",
+            f"[{colour}]{v.support.value}[/{colour}]",
+        )  # fmt: skip
+    return table
+
+
+def print_verdicts(console: Console, model: ImpedanceModel, posterior: Posterior) -> list[Verdict]:
+    """The table, then a sentence for each, then what they all presuppose."""
+    verdicts = model.verdicts(posterior)
+    console.print(verdict_table(verdicts))
+    for verdict in verdicts:
+        console.print(f"  {verdict.sentence}", highlight=False)
+    remark = caveat(verdicts, posterior, model.config)
+    if remark:
+        console.print(f"  {remark}", style="yellow", highlight=False)
+    return verdicts
+
+
+def hyperparameter_table(model: ImpedanceModel) -> Table:
+    """Hyperparameters in SI units: hyperprior against posterior, 90 % intervals."""
+    axes = model.fitted.log.axes
+    table = Table(title="Hyperparameters: prior against posterior (Laplace)", title_justify="left")
+    for name in ("", "axis", "prior median", "prior 90 %", "posterior", "posterior 90 %", "unit"):
+        table.add_column(name, justify="left" if name in ("", "axis", "unit") else "right")
+    for entry in model.hyperparameters:
+        for c, label in enumerate(entry.labels):
+            for a, axis in enumerate(axes):
+                table.add_row(*_hyperparameter_row(entry, c, label, a, axis, model))
+        table.add_section()
+    return table
+
+
+def _hyperparameter_row(entry: Entry, c: int, label: str, a: int, axis: str, model: ImpedanceModel) -> list[str]:
+    spec = entry.specs[c]
+    name = f"{entry.name} {label}".strip()
+    value = float(entry.value[a, 0, 0, c].detach())
+    if spec.fixed:
+        return [name, axis, f"{spec.median:.4g}", "fixed", f"{value:.4g}", "fixed", entry.units[c]]
+    spread = model.report.log_sd.get(entry.name)
+    log_sd = float("nan") if spread is None else spread[a][c]
+    interval = "not determined" if np.isnan(log_sd) else _interval(value, log_sd)
+    prior = _interval(spec.median, spec.log_sd)
+    return [name, axis, f"{spec.median:.4g}", prior, f"{value:.4g}", interval, entry.units[c]]
+
+
+def _interval(median: float, log_sd: float) -> str:
+    low, high = median * np.exp(np.array([-1.645, 1.645]) * log_sd)
+    return f"{low:.3g} … {high:.3g}"
+
+
+def restart_table(model: ImpedanceModel) -> Table:
+    """How every restart ended."""
+    report = model.report
+    table = Table(title="Restarts of the optimiser", title_justify="left")
+    for name in ("restart", "log posterior", "log likelihood", "iterations", "evaluations", "seconds", "outcome"):
+        table.add_column(name, justify="left" if name == "outcome" else "right")
+    for r in report.restarts:
+        best = [axis for axis, index in zip(model.fitted.log.axes, report.best, strict=True) if index == r.restart]
+        outcome = r.outcome.lower() + (f"; best for {', '.join(best)}" if best else "")
+        table.add_row(
+            str(r.restart), _values(r.objective), _values(r.log_likelihood), str(r.iterations),
+            str(r.evaluations), f"{r.seconds:.1f}", outcome,
+        )  # fmt: skip
+    return table
+
+
+def _values(values: Sequence[float]) -> str:
+    return " ".join(f"{value:.2f}" for value in values)
+
+
+def evaluation_table(evaluation: Evaluation) -> Table:
+    """Scores by axis and model."""
+    table = Table(title="Predicted force, given the training forces only", title_justify="left")
+    for name in ("axis", "model", "SMSE", "MSLL", "NLPD", "coverage of 90 % band", "samples"):
+        table.add_column(name, justify="left" if name in ("axis", "model") else "right")
+    for axis, models in evaluation.items():
+        for name, s in models.items():
+            table.add_row(
+                axis, name, f"{s.smse:.4f}", f"{s.msll:.3f}", f"{s.nlpd:.3f}", f"{s.coverage90:.3f}", str(s.n)
+            )
+        table.add_section()
+    return table
