@@ -171,7 +171,7 @@ def infer(
     _posterior_format(out)
     check_writable(out)
     trained = load_model(model)
-    log = read_log(logs, trained.config.log, require_force=given is not Given.training and given is not Given.both)
+    log = read_log(logs, trained.config.log, require_force=given is Given.log)
     posterior = trained.posterior(log, given.value)
     _write_posterior(posterior, out)
     verdicts = terminal.print_verdicts(console, trained, posterior)

@@ -234,7 +234,7 @@ class DesiredTrajectoryPrior(Section):
     length_scale: LengthScales = LengthScales()
     shape: Scale = Hyperparameter(median=1.0, fixed=True)
     value: dict[Axis, float] | None = None
-    average_knots: int = Field(default=20, ge=1, le=500)
+    average_knots: int = Field(default=6, ge=1, le=500)
 
 
 class ResidualPrior(Section):

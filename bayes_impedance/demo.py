@@ -51,7 +51,8 @@ def record(folder: Path, seed: int = 0) -> Recording:
     training, testing = folder / "training.csv", folder / "testing.csv"
     write_log(log.select(range(REPETITIONS - 1)), training)
     write_log(log.select([REPETITIONS - 1]), testing)
-    return Recording(training, testing, load_config("phase"))
+    # Half the usual rate: the displacements end at 2 Hz, and the demo should end within a minute.
+    return Recording(training, testing, load_config("phase", ["preprocessing.rate=12.5"]))
 
 
 def _drawn(motion: PreparedLog, seed: int) -> PreparedLog:

@@ -109,6 +109,11 @@ def caveat(verdicts: Iterable[Verdict], posterior: Posterior, config: Config) ->
     )
 
 
+def rounded(contraction: float) -> str:
+    """Contraction with two digits, never rounded up to certainty."""
+    return "> 0.99" if contraction > 0.99 else f"{contraction:.2f}"
+
+
 def _percentage(contraction: float) -> str:
     """A share that never claims to be all of it."""
     return "over 99 %" if contraction > 0.99 else f"{max(contraction, 0.0):.0%}".replace("%", " %")

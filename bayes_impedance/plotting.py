@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from bayes_impedance.identifiability import Verdict
+from bayes_impedance.identifiability import Verdict, rounded
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
 from bayes_impedance.outputs import whole_file
 from bayes_impedance.posterior import UNITS, Marginal, Posterior
@@ -22,7 +22,6 @@ from bayes_impedance.posterior import UNITS, Marginal, Posterior
 Array = NDArray[np.float64]
 
 POSTERIOR, PRIOR, MEASURED, TRUTH = "#0b6e99", "#9aa5ab", "#1a1a1a", "#c2410c"
-SYMBOLS = {Latent.STIFFNESS: "k", Latent.DAMPING: "d", Latent.MASS: "m"}
 
 
 def plot_force(posterior: Posterior, trials: Sequence[int] | None = None) -> Figure:
@@ -82,10 +81,12 @@ def plot_impedance(posterior: Posterior, verdicts: Iterable[Verdict], trial: int
             if marginal.warped:
                 ax.set_yscale("log")
             verdict = said[latent, axis]
-            ax.set_title(f"{verdict.support.value} (contraction {verdict.contraction:.2f})", fontsize=8)
-            symbol = f"{SYMBOLS[latent]}$_{{{axis}{axis}}}$"
-            _label(ax, a, row, len(IMPEDANCE_ORDER), f"{latent.value} {symbol if a == 0 else ''} [{UNITS[latent]}]",
-                   "phase" if by_phase else "time [s]")  # fmt: skip
+            ax.set_title(
+                f"{latent.value} {axis}{axis}: {verdict.support.value} (contraction {rounded(verdict.contraction)})",
+                fontsize=8,
+            )
+            unit = f"{latent.value} [{UNITS[latent]}]"
+            _label(ax, a, row, len(IMPEDANCE_ORDER), unit, "phase" if by_phase else "time [s]")
     return _finished(figure, grid, f"Impedance along trial {record.name}, axes {', '.join(posterior.axes)}")
 
 

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from bayes_impedance.config import TrainingConfig
 from bayes_impedance.evaluation import Evaluation
-from bayes_impedance.identifiability import Support, Verdict, caveat
+from bayes_impedance.identifiability import Support, Verdict, caveat, rounded
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.posterior import Posterior
 from bayes_impedance.priors import Entry
@@ -41,14 +41,16 @@ def training_progress(console: Console, config: TrainingConfig, what: str) -> It
 def verdict_table(verdicts: Sequence[Verdict]) -> Table:
     """Path averages of stiffness, damping and mass, each beside its verdict."""
     table = Table(title="Impedance, averaged over the samples", title_justify="left")
-    for name in ("", "mean", "90 % interval", "prior 90 %", "unit", "contraction", "verdict"):
-        table.add_column(name, justify="left" if name in ("", "unit", "verdict") else "right")
+    table.add_column("")
+    for name in ("mean", "90 % interval", "prior 90 %", "contraction"):
+        table.add_column(name, justify="right")
+    table.add_column("verdict")
     for v in verdicts:
         colour = COLOURS[v.support]
         table.add_row(
-            f"{v.latent.value} {v.axis}{v.axis}", f"{v.mean:.4g}", f"{v.q05:.4g} … {v.q95:.4g}",
-            f"{v.prior_q05:.3g} … {v.prior_q95:.3g}", v.unit, f"{v.contraction:.3f}",
-            f"[{colour}]{v.support.value}[/{colour}]",
+            f"{v.latent.value} {v.axis}{v.axis} [{v.unit}]".replace("[", "\\["), f"{v.mean:.4g}",
+            f"{v.q05:.4g} … {v.q95:.4g}", f"{v.prior_q05:.3g} … {v.prior_q95:.3g}", rounded(v.contraction),
+            f"[{colour}]{v.support.name.lower().replace('_', ' ')}[/{colour}]",
         )  # fmt: skip
     return table
 

@@ -29,8 +29,8 @@ Array = NDArray[np.float64]
 BOUND = 6.0
 #: Unconstrained range of a hyperparameter that lives in an interval (a sigmoid).
 INTERVAL_BOUND = 8.0
-#: Relative improvement at which a restart has converged: some 1e-6 nats of a thousand.
-RELATIVE_TOLERANCE = 1e-9
+#: Relative improvement an iteration at which a restart has converged: 1e-5 of a hundred nats.
+RELATIVE_TOLERANCE = 1e-7
 HESSIAN_STEP = 1e-3
 
 

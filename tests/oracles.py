@@ -200,7 +200,9 @@ def path_derivatives(
     """∂_tⁱ ∂_t'ʲ k(θ(t), θ(t')) for all pairs of samples."""
 
     def along(t1: Tensor, t2: Tensor) -> Tensor:
-        theta1 = expansion(one.theta[:, None], one.velocity[:, None], one.acceleration[:, None], t1[..., None])
+        theta1 = expansion(
+            one.theta[:, None], one.velocity[:, None], one.acceleration[:, None], t1[..., None]
+        )
         theta2 = expansion(two.theta[None], two.velocity[None], two.acceleration[None], t2[..., None])
         return covariance(theta1, theta2)
 
@@ -217,7 +219,7 @@ def stacked(table: list[list[Tensor]]) -> Tensor:
 
 @dataclass(frozen=True)
 class ForceOracle:
-    """Moments of u = Σ_j w_j e⁽ʲ⁾ + ũ as moments of products of independent factors; `processes` k, d[, m]."""
+    """Moments of u = Σ_j w_j e⁽ʲ⁾ + ũ from products of independent factors; `processes` are k, d[, m]."""
 
     trajectory: TrajectorySpec
     processes: tuple[ProcessSpec, ...]
@@ -328,7 +330,7 @@ def condition(
     oracle: ForceOracle, given: Samples, force: Tensor, target: Samples, latent: str, noise_variance: float,
     level_variance: Sequence[float] = (0.0, 0.0, 0.0), jitter: float = 0.0,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
-    """Mean and variance of a latent by solving with the full covariance; a new measurement where it is force."""
+    """Mean and variance of a latent by solving with the full covariance; force is a new measurement."""
     variances = torch.diag(torch.tensor(level_variance, dtype=torch.float64))
     a, b = oracle.level_loading(given, "force"), oracle.level_loading(target, latent)
     own = oracle.covariance(given, given)
@@ -445,7 +447,9 @@ def _trial_samples(config: Config, trial: PreparedTrial, axis: int) -> tuple[obj
     }
     used = [model.stiffness.input, model.damping.input]
     used += [] if model.residual is None else [model.residual.input]
-    xi = {"+".join(inputs): _tensor(np.hstack([values[name] for name in inputs])) for inputs in used if inputs}
+    xi = {
+        "+".join(inputs): _tensor(np.hstack([values[name] for name in inputs])) for inputs in used if inputs
+    }
     arrays = (theta, velocity, acceleration, desired - hand, desired)
     return (*(_tensor(array) for array in arrays), xi)
 
@@ -480,4 +484,6 @@ def feature_map(config: Config, log: PreparedLog) -> FeatureMap:
 def truth_of(log: PreparedLog, name: str) -> np.ndarray:
     """A true latent at every sample, `(samples, axes)`."""
     ends = [axis + axis if name in IMPEDANCE else axis for axis in log.axes]
-    return np.stack([np.concatenate([trial.truth[f"{name}_{end}"] for trial in log.trials]) for end in ends], 1)
+    return np.stack(
+        [np.concatenate([trial.truth[f"{name}_{end}"] for trial in log.trials]) for end in ends], 1
+    )

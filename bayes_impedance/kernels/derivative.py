@@ -6,14 +6,13 @@ b = d²θ/dt². The forms are thin matrix products; the rest is one pass over th
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from bayes_impedance.kernels.stationary import (
-    Ratio,
-    SquaredExponential,
+    Profile,
     StationaryKernel,
     half_squared_distance,
     stack_columns,
@@ -31,18 +30,19 @@ class Path(NamedTuple):
 class Forms(NamedTuple):
     """s and its time derivatives s_ij = ∂_tⁱ ∂_t'ʲ s, each `(..., n1, n2)`; None stands for zero."""
 
-    s: Tensor
-    s10: Tensor
-    s01: Tensor
-    s11: Tensor
-    s20: Tensor
-    s02: Tensor
-    s21: Tensor | None
-    s12: Tensor | None
-    s22: Tensor | None
+    s: Any
+    s10: Any
+    s01: Any
+    s11: Any
+    s20: Any
+    s02: Any
+    s21: Any
+    s12: Any
+    s22: Any
 
 
-Table = list[list[Tensor]]
+#: Entries are tensors, floats where they are constant, or NumPy arrays in one-point prediction.
+Table = list[list[Any]]
 
 
 def derivative_table(
@@ -60,17 +60,29 @@ def derivative_table(
         variance = variance[..., 0]
         shape = None if shape is None else shape[..., 0]
     common, ratios = kernel.profile.derivatives(forms.s, shape)
-    if isinstance(kernel.profile, SquaredExponential):
-        return variance * common, _table_exponential(forms, order)
-    return variance * common, _table(forms, ratios, order)
+    return variance * common, combine(kernel.profile, forms, ratios, order)
 
 
-def _table(forms: Forms, ratios: tuple[Ratio, ...], order: int) -> Table:
+def combine(profile: Profile, forms: Forms, ratios: tuple[Any, ...], order: int) -> Table:
+    """The derivatives over the common factor, from the bilinear forms and the ratios κ⁽ⁿ⁾/κ̃."""
+    if profile.is_exponential:
+        return _table_exponential(forms, order)
+    return _table(forms, ratios, order)
+
+
+def multiply_add(total: Any, a: Any, b: Any, value: float = 1.0) -> Any:
+    """`total` + `value` · a · b for tensors in one pass, and for NumPy arrays, which one-point prediction uses."""
+    if isinstance(total, Tensor) and isinstance(a, Tensor) and isinstance(b, Tensor):
+        return torch.addcmul(total, a, b, value=value)
+    return total + value * a * b
+
+
+def _table(forms: Forms, ratios: tuple[Any, ...], order: int) -> Table:
     """The nine derivatives over the common factor, from the ratios κ⁽ⁿ⁾/κ̃."""
     r0, r1, r2, r3, r4 = ratios
     s10, s01, s11 = forms.s10, forms.s01, forms.s11
     s10s01 = s10 * s01
-    k00 = torch.as_tensor(r0, dtype=s10.dtype)
+    k00 = r0
     k10, k01 = r1 * s10, r1 * s01
     k11 = r2 * s10s01 + r1 * s11
     if order == 1:
@@ -100,21 +112,21 @@ def _table(forms: Forms, ratios: tuple[Ratio, ...], order: int) -> Table:
 def _table_exponential(forms: Forms, order: int) -> Table:
     """The same for κ⁽ⁿ⁾ = (−1)ⁿ κ, where the sums collapse; this is what training spends its time on."""
     s10, s01, s11 = forms.s10, forms.s01, forms.s11
-    k00 = torch.ones((), dtype=s10.dtype)
+    k00 = 1.0
     k10, k01 = -s10, -s01
-    k11 = torch.addcmul(-s11, s10, s01)
+    k11 = multiply_add(-s11, s10, s01)
     if order == 1:
         return [[k00, k01], [k10, k11]]
-    k20 = torch.addcmul(-forms.s20, s10, s10)
-    k02 = torch.addcmul(-forms.s02, s01, s01)
+    k20 = multiply_add(-forms.s20, s10, s10)
+    k02 = multiply_add(-forms.s02, s01, s01)
     # k21 = −s01 k20 + 2 s10 s11 − s21
-    k21 = torch.addcmul(k01 * k20, s10, s11, value=2.0)
-    k12 = torch.addcmul(k10 * k02, s01, s11, value=2.0)
+    k21 = multiply_add(k01 * k20, s10, s11, value=2.0)
+    k12 = multiply_add(k10 * k02, s01, s11, value=2.0)
     # k22 = k20 k02 + 2 s11 (s11 − 2 s10 s01) + 2 s10 s12 + 2 s01 s21 − s22
-    k22 = torch.addcmul(k20 * k02, s11, torch.addcmul(s11, s10, s01, value=-2.0), value=2.0)
+    k22 = multiply_add(k20 * k02, s11, multiply_add(s11, s10, s01, value=-2.0), value=2.0)
     if forms.s21 is not None and forms.s12 is not None and forms.s22 is not None:
         k21, k12 = k21 - forms.s21, k12 - forms.s12
-        k22 = torch.addcmul(torch.addcmul(k22, s10, forms.s12, value=2.0), s01, forms.s21, value=2.0) - forms.s22
+        k22 = multiply_add(multiply_add(k22, s10, forms.s12, value=2.0), s01, forms.s21, value=2.0) - forms.s22
     return [[k00, k01, k02], [k10, k11, k12], [k20, k21, k22]]
 
 

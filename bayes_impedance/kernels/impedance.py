@@ -11,13 +11,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 import torch
 from gpytorch.kernels import Kernel
 from gpytorch.means import Mean
 from torch import Tensor
 
-from bayes_impedance.kernels.derivative import Path, Table, derivative_table
+from bayes_impedance.kernels.derivative import Path, Table, derivative_table, multiply_add
 from bayes_impedance.kernels.stationary import StationaryKernel
 from bayes_impedance.kernels.warped import ImpedanceProcess, evaluate
 
@@ -90,33 +91,34 @@ def same_label(x1: Tensor, x2: Tensor, column: int | None, diag: bool = False) -
 
 
 def force_covariance(
-    expectation1: Sequence[Tensor],
-    expectation2: Sequence[Tensor],
-    covariance: Mapping[tuple[int, int], Tensor],
+    expectation1: Sequence[Any],
+    expectation2: Sequence[Any],
+    covariance: Mapping[tuple[int, int], Any],
     table: Table,
-    common: Tensor,
-    error1: Sequence[Tensor] | None = None,
-    error2: Sequence[Tensor] | None = None,
-) -> Tensor:
+    common: Any,
+    error1: Sequence[Any] | None = None,
+    error2: Sequence[Any] | None = None,
+) -> Any:
     """Σ_ij (E_i E_j' + C_ij) D_ij + Σ_ij C_ij ē_i ē_j', D_ij = `common` · `table[i][j]` (DESIGN §3).
 
     `expectation1[i]` E_i broadcasts as `(..., n1, 1)`, `expectation2[j]` as `(..., 1, n2)`, `error1` and
     `error2` alike; `covariance[i, j]` C_ij is `(..., n1, n2)`, absent pairs are independent.
+    NumPy arrays serve as well as tensors.
     """
     orders = range(len(table))
-    total: Tensor | None = None
+    total = None
     for j in orders:
         column = expectation1[0] * table[0][j]
         for i in orders[1:]:
-            column = torch.addcmul(column, expectation1[i], table[i][j])
-        total = column * expectation2[j] if total is None else torch.addcmul(total, column, expectation2[j])
+            column = multiply_add(column, expectation1[i], table[i][j])
+        total = column * expectation2[j] if total is None else multiply_add(total, column, expectation2[j])
     assert total is not None
     for (i, j), c in covariance.items():
-        total = torch.addcmul(total, c, table[i][j])
+        total = multiply_add(total, c, table[i][j])
     total = total * common
     if error1 is not None and error2 is not None:
         for (i, j), c in covariance.items():
-            total = torch.addcmul(total, c, error1[i] * error2[j])
+            total = multiply_add(total, c, error1[i] * error2[j])
     return total
 
 

@@ -33,6 +33,8 @@ class Profile(ABC):
     #: from |θ|² + |θ'|² − 2θᵀθ', whose rounding of 1e-16 in s would become 1e-8 in √s.
     exact_distance: ClassVar[bool] = False
     has_shape: ClassVar[bool] = False
+    #: True where κ⁽ⁿ⁾ = (−1)ⁿ κ: the sums over derivatives then collapse.
+    is_exponential: ClassVar[bool] = False
 
     @abstractmethod
     def value(self, s: Tensor, shape: Tensor | None = None) -> Tensor:
@@ -45,6 +47,8 @@ class Profile(ABC):
 
 class SquaredExponential(Profile):
     """κ = e^{−s}, κ⁽ⁿ⁾ = (−1)ⁿ κ."""
+
+    is_exponential: ClassVar[bool] = True
 
     def value(self, s: Tensor, shape: Tensor | None = None) -> Tensor:
         """κ(s) = e^{−s}."""

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dpstrf
 from torch import Tensor
 
 from bayes_impedance.config import Config
@@ -155,9 +156,23 @@ def _sample(covariance: Tensor, generator: torch.Generator) -> Tensor:
     # On the scale of correlations rounding does not carry from accelerations over to positions.
     safe = torch.where(scale > 0, scale, 1.0)
     correlation = covariance / (safe.unsqueeze(-1) * safe.unsqueeze(-2))
-    values, vectors = torch.linalg.eigh(correlation)
-    standard = torch.randn(values.shape, generator=generator, dtype=values.dtype)
-    return scale * ((vectors * values.clamp_min(0.0).sqrt().unsqueeze(-2)) @ standard.unsqueeze(-1)).squeeze(-1)
+    standard = torch.randn(scale.shape, generator=generator, dtype=scale.dtype)
+    drawn = [
+        _factor(c) @ z
+        for c, z in zip(correlation.reshape(-1, *correlation.shape[-2:]), standard.flatten(0, -2), strict=True)
+    ]
+    return scale * torch.stack(drawn).reshape(scale.shape)
+
+
+def _factor(correlation: Tensor) -> Tensor:
+    """R with R Rᵀ = `correlation` to rounding, by Cholesky with pivoting: it ends at the numerical rank."""
+    n = correlation.shape[-1]
+    lower, pivots, rank, _ = dpstrf(correlation.numpy(), lower=1)
+    factor = np.tril(lower)
+    factor[:, rank:] = 0.0
+    result = np.empty((n, n))
+    result[pivots - 1] = factor
+    return torch.from_numpy(result)
 
 
 def _pace(time: Array, duration: float, generator: np.random.Generator) -> tuple[Array, Array, Array]:

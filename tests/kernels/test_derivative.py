@@ -92,7 +92,10 @@ def test_coincident_samples_equal_the_closed_form(name: str) -> None:
         for j in range(3):
             scale = (expected[i][i].abs().max() * expected[j][j].abs().max()).sqrt()
             assert (diagonal[i][j] - expected[i][j]).abs().max() < 1e-11 * scale, (i, j)
-            assert (full[i][j].diagonal(dim1=-2, dim2=-1) - expected[i][j]).abs().max() < 1e-11 * scale, (i, j)
+            assert (full[i][j].diagonal(dim1=-2, dim2=-1) - expected[i][j]).abs().max() < 1e-11 * scale, (
+                i,
+                j,
+            )
 
 
 @pytest.mark.parametrize("p", [1, 2, 4])
@@ -121,8 +124,12 @@ def test_no_acceleration_equals_zero_acceleration(name: str, diag: bool) -> None
     zero = torch.zeros_like(one.theta)
     if diag:
         two = one
-    without = products(kernel, path_of(one)._replace(acceleration=None), path_of(two)._replace(acceleration=None), diag=diag)
-    with_zero = products(kernel, path_of(one)._replace(acceleration=zero), path_of(two)._replace(acceleration=zero), diag=diag)
+    without = products(
+        kernel, path_of(one)._replace(acceleration=None), path_of(two)._replace(acceleration=None), diag=diag
+    )
+    with_zero = products(
+        kernel, path_of(one)._replace(acceleration=zero), path_of(two)._replace(acceleration=zero), diag=diag
+    )
     for row, expected_row in zip(without, with_zero, strict=True):
         for entry, expected in zip(row, expected_row, strict=True):
             torch.testing.assert_close(entry, expected, rtol=1e-14, atol=1e-16)
@@ -177,7 +184,10 @@ def test_batched_hyperparameters_broadcast(name: str) -> None:
     kernel.sd = torch.tensor([0.5, 1.0, 2.0]).reshape(3, 1, 1, 1)
     kernel.lengthscale = torch.tensor([[0.4, 0.7], [1.0, 0.6], [0.8, 2.0]]).reshape(3, 1, 1, 2)
     one, two = random_samples(5, 2, 1, batch=(3, 4)), random_samples(6, 2, 2, batch=(3, 4))
-    table, diagonal = products(kernel, path_of(one), path_of(two)), products(kernel, path_of(one), path_of(one), diag=True)
+    table, diagonal = (
+        products(kernel, path_of(one), path_of(two)),
+        products(kernel, path_of(one), path_of(one), diag=True),
+    )
     for a in range(3):
         single = StationaryKernel(name, num_dims=2).double()
         single.sd, single.lengthscale = kernel.sd[a, 0], kernel.lengthscale[a, 0]
@@ -203,7 +213,11 @@ def test_gradients_by_hyperparameters_equal_finite_differences(name: str, p: int
 
     def function(*values: Tensor) -> tuple[Tensor, ...]:
         state = dict(zip(names, values, strict=True))
-        return tuple(torch.func.functional_call(_Table(kernel), {f"kernel.{k}": v for k, v in state.items()}, (one, two)))
+        return tuple(
+            torch.func.functional_call(
+                _Table(kernel), {f"kernel.{k}": v for k, v in state.items()}, (one, two)
+            )
+        )
 
     values = [value.detach().clone().requires_grad_() for value in kernel.parameters()]
     assert torch.autograd.gradcheck(function, values, eps=1e-6, atol=1e-5, rtol=1e-5)
