@@ -44,7 +44,8 @@ app = typer.Typer(
 
 Model = Annotated[Path, typer.Argument(help="Folder that train wrote.", show_default=False)]
 Logs = Annotated[
-    list[Path], typer.Argument(help="Recordings: .csv, .tsv, .txt or .parquet; several may follow.", show_default=False)
+    list[Path],
+    typer.Argument(help="Recordings: .csv, .tsv, .txt or .parquet; several may follow.", show_default=False),
 ]
 
 
@@ -76,7 +77,9 @@ def main() -> None:
 
 
 @app.callback(invoke_without_command=True)
-def _version(version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False) -> None:
+def _version(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+) -> None:
     if version:
         from importlib.metadata import version as installed
 
@@ -96,7 +99,9 @@ def demo(
     console = Console()
     prepare_folder(out)
     recording = record(out, seed)
-    console.print(f"wrote {recording.training} (4 repetitions) and {recording.testing} (a fifth), truth included")
+    console.print(
+        f"wrote {recording.training} (4 repetitions) and {recording.testing} (a fifth), truth included"
+    )
     model = ImpedanceModel(recording.config)
     with terminal.training_progress(console, recording.config.training, "training") as progress:
         model = model.fit(read_log(recording.training, recording.config.log), progress)
@@ -107,7 +112,9 @@ def demo(
     listed = ", ".join(f"{name} {error:.1%}" for name, error in errors.items())
     console.print(f"Mean relative error against the truth: {listed}", highlight=False)
     with terminal.training_progress(console, recording.config.training, "naive GP") as progress:
-        scores = evaluate(model, read_log(recording.testing, recording.config.log), naive=True, progress=progress)
+        scores = evaluate(
+            model, read_log(recording.testing, recording.config.log), naive=True, progress=progress
+        )
     console.print(terminal.evaluation_table(scores))
     _write_posterior(posterior, out / "posterior.csv")
     figures = save_figures(posterior, verdicts, out)
@@ -125,7 +132,9 @@ def train(
     out: Annotated[Path, typer.Option(help="Folder for the model; one that train wrote before is replaced.")],
     overrides: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change one key, e.g. training.restarts=5; repeatable."),
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="Change one key, e.g. training.restarts=5; repeatable."
+        ),
     ] = None,
 ) -> None:
     """Train hyperparameters on recordings (MAP of the marginal likelihood) and write the model.
@@ -147,7 +156,9 @@ def train(
     save_model(model, out)
     console.print(terminal.restart_table(model))
     terminal.print_verdicts(console, model, model.posterior(model.fitted.log))
-    console.print(f"wrote {out}; look at it with: bayes-impedance show {out}", highlight=False, soft_wrap=True)
+    console.print(
+        f"wrote {out}; look at it with: bayes-impedance show {out}", highlight=False, soft_wrap=True
+    )
     if model.report.interrupted:
         console.print("training was interrupted: the model holds the best hyperparameters found until then")
         raise typer.Exit(INTERRUPTED)
@@ -207,7 +218,9 @@ def evaluate_command(
 @app.command()
 def show(
     model: Model,
-    json_output: Annotated[bool, typer.Option("--json", help="Print estimates and verdicts as JSON.")] = False,
+    json_output: Annotated[
+        bool, typer.Option("--json", help="Print estimates and verdicts as JSON.")
+    ] = False,
 ) -> None:
     """Show hyperparameters in SI units, prior against posterior, the verdict on impedance, and what trained them."""
     console = Console()
@@ -230,7 +243,9 @@ def show(
 
 def _posterior_format(path: Path) -> str:
     if path.suffix not in (".csv", ".parquet"):
-        raise OutputError(f"{path}: expected a file name ending in .csv or .parquet, got '{path.suffix}'; rename it")
+        raise OutputError(
+            f"{path}: expected a file name ending in .csv or .parquet, got '{path.suffix}'; rename it"
+        )
     return path.suffix
 
 

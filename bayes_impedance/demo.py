@@ -46,7 +46,9 @@ def record(folder: Path, seed: int = 0) -> Recording:
 
     The motion is perturbed; force is drawn from the generative model, and the truth stands beside it.
     """
-    motion = repeated_motion(repetitions=REPETITIONS, duration=4.0, rate=100.0, displacement_sd=0.012, seed=seed)
+    motion = repeated_motion(
+        repetitions=REPETITIONS, duration=4.0, rate=100.0, displacement_sd=0.012, seed=seed
+    )
     log = as_recording(_drawn(motion, seed))
     training, testing = folder / "training.csv", folder / "testing.csv"
     write_log(log.select(range(REPETITIONS - 1)), training)
@@ -101,4 +103,6 @@ def prepare_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"{folder}: could not be created: {error.strerror}; choose another --out") from error
+        raise OutputError(
+            f"{folder}: could not be created: {error.strerror}; choose another --out"
+        ) from error

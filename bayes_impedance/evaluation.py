@@ -64,6 +64,8 @@ def as_json(evaluation: Evaluation) -> dict[str, object]:
 
 def _scores(posterior: Posterior, training: PreparedLog, axis: int) -> Scores:
     marginal = posterior[Latent.FORCE]
-    force = np.concatenate([trial.force[:, axis] for trial in posterior.log.trials if trial.force is not None])
+    force = np.concatenate(
+        [trial.force[:, axis] for trial in posterior.log.trials if trial.force is not None]
+    )
     trained = np.concatenate([trial.force[:, axis] for trial in training.trials if trial.force is not None])
     return score(marginal.mean[:, axis], marginal.sd[:, axis], force, trained)

@@ -48,7 +48,9 @@ class FeatureMap:
         self.model = model
         self.axes = axes
         self.theta = theta_components(model)
-        self.xi = tuple(dict.fromkeys((*model.stiffness.input, *model.damping.input, *_residual_input(model))))
+        self.xi = tuple(
+            dict.fromkeys((*model.stiffness.input, *model.damping.input, *_residual_input(model)))
+        )
         shared = config.shared.desired_trajectory
         self.trajectory_shared = model.trajectory_input != "time" if shared is None else shared
         self.residual_shared = config.shared.residual
@@ -111,7 +113,7 @@ class FeatureMap:
             inputs[:, g, :length] = np.concatenate([blocks[i][0] for i in member], axis=1)
             means[:, g, :length] = np.concatenate([blocks[i][1] for i in member], axis=1)
             if has_force:
-                force[:, g, :length] = np.concatenate([log.trials[i].force for i in member]).T  # type: ignore[arg-type]
+                force[:, g, :length] = np.concatenate([log.trials[i].force for i in member]).T
             valid[g, :length] = True
             rows.append(np.concatenate([_row_index(i, len(log.trials[i].time)) for i in member]))
         return Features(

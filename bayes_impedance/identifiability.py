@@ -89,9 +89,7 @@ def _sentence(
     if support is not Support.PRIOR_ONLY:
         return f"{name}: {support.value}; {share}."
     if config.model.desired_trajectory.mean == "equilibrium":
-        reason = (
-            "with the equilibrium mean the force only tells the product of impedance and the desired trajectory's SD"
-        )
+        reason = "with the equilibrium mean the force tells only the product of impedance and the SD of x_d"
     else:
         reason = "perturb the motion, repeat it, or give a reference"
     return f"{name}: prior only; {share}: {reason}."

@@ -20,7 +20,9 @@ def check_writable(path: Path) -> None:
     """
     parent = path.absolute().parent
     if not parent.is_dir():
-        raise OutputError(f"{path}: expected an existing folder {parent} to write into, found none; create it")
+        raise OutputError(
+            f"{path}: expected an existing folder {parent} to write into, found none; create it"
+        )
     try:
         with tempfile.TemporaryFile(dir=parent):
             pass

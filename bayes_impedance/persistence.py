@@ -1,9 +1,9 @@
 """A trained model as a folder: YAML, JSON and safetensors, no pickle; loading gives the same bits.
 
-    config.yaml                   the whole configuration
-    hyperparameters.safetensors   unconstrained hyperparameters, by name
-    data.safetensors              the prepared training log
-    metadata.json                 schema and package version, training report, fingerprints
+config.yaml                   the whole configuration
+hyperparameters.safetensors   unconstrained hyperparameters, by name
+data.safetensors              the prepared training log
+metadata.json                 schema and package version, training report, fingerprints
 """
 
 from __future__ import annotations
@@ -47,7 +47,9 @@ def save_model(model: ImpedanceModel, folder: str | Path) -> None:
         (place / "config.yaml").write_text(dump_config(model.config), encoding="utf-8")
         tensors = {entry.name: entry.raw.detach().numpy() for entry in fit.force_model.entries}
         save_file(tensors, place / "hyperparameters.safetensors")
-        save_file({k: np.ascontiguousarray(v) for k, v in fit.log.arrays().items()}, place / "data.safetensors")
+        save_file(
+            {k: np.ascontiguousarray(v) for k, v in fit.log.arrays().items()}, place / "data.safetensors"
+        )
         metadata = {
             "schema_version": SCHEMA_VERSION,
             "package_version": version("bayes-impedance"),
@@ -95,13 +97,15 @@ def _assemble(place: Path, metadata: Mapping[str, Any]) -> ImpedanceModel:
     for entry in force_model.entries:
         with torch.no_grad():
             entry.raw.copy_(torch.from_numpy(tensors[entry.name]))
-    report = dict(metadata["report"])
+    report: dict[str, Any] = metadata["report"]
     restarts = tuple(
         RestartReport(**{**item, **{k: tuple(item[k]) for k in ("objective", "log_likelihood")}})
-        for item in report.pop("restarts")
+        for item in report["restarts"]
     )
-    lists = {key: tuple(report.pop(key)) for key in ("best", "log_likelihood", "objective")}
-    return ImpedanceModel(config, Fit(force_model, log, TrainingReport(restarts=restarts, **lists, **report)))
+    lists = {key: tuple(report[key]) for key in ("best", "log_likelihood", "objective")}
+    return ImpedanceModel(
+        config, Fit(force_model, log, TrainingReport(**{**report, **lists, "restarts": restarts}))
+    )
 
 
 def _metadata(place: Path) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,6 +21,7 @@ from bayes_impedance.outputs import whole_file
 from bayes_impedance.posterior import UNITS, Marginal, Posterior
 
 Array = NDArray[np.float64]
+Share = Literal["all", "row", "col"]
 
 POSTERIOR, PRIOR, MEASURED, TRUTH = "#0b6e99", "#9aa5ab", "#1a1a1a", "#c2410c"
 
@@ -116,9 +118,11 @@ def _chosen(posterior: Posterior, trials: Sequence[int] | None) -> list[int]:
     return list(range(len(posterior.log.trials)) if trials is None else trials)[:4]
 
 
-def _grid(rows: int, columns: int, sharex: str, sharey: str, height: float = 2.4) -> tuple[Figure, list[list[Axes]]]:
+def _grid(
+    rows: int, columns: int, sharex: Share, sharey: Share, height: float = 2.4
+) -> tuple[Figure, list[list[Axes]]]:
     figure = Figure(figsize=(max(6.0, 3.2 * columns), 0.7 + height * rows), layout="constrained")
-    grid = figure.subplots(rows, columns, sharex=sharex, sharey=sharey, squeeze=False)  # type: ignore[arg-type]
+    grid = figure.subplots(rows, columns, sharex=sharex, sharey=sharey, squeeze=False)
     return figure, [list(row) for row in grid]
 
 

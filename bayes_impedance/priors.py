@@ -18,17 +18,24 @@ from gpytorch.likelihoods import GaussianLikelihood
 from gpytorch.priors import NormalPrior
 from torch import Tensor
 
-from bayes_impedance.config import LARGEST_LOG_SD, Component, Config, Hyperparameter, ImpedancePrior, LengthScales
+from bayes_impedance.config import (
+    LARGEST_LOG_SD,
+    Component,
+    Config,
+    Hyperparameter,
+    ImpedancePrior,
+    LengthScales,
+)
 from bayes_impedance.features import UNITS, FeatureMap, baseline_components, theta_components
 from bayes_impedance.kernels.impedance import ImpedanceKernel, InputLayout, InteractionKernel
 from bayes_impedance.kernels.stationary import StationaryKernel, log_positive
-from bayes_impedance.kernels.warped import ImpedanceProcess
+from bayes_impedance.kernels.warped import ImpedanceProcess, Law
 
 #: Constrained values stay inside the open interval that their constraint maps to.
 INSIDE = 1e-3
 
 
-class LogScalePrior(NormalPrior):  # type: ignore[misc]
+class LogScalePrior(NormalPrior):
     """log h ~ N(log median, log_sd²), as a density over log h: its mode is the median of h."""
 
     def __init__(self, median: Tensor, log_sd: Tensor) -> None:
@@ -77,7 +84,9 @@ class Entry:
         low, high = self.constraint.lower_bound, self.constraint.upper_bound
         if torch.isfinite(high).all():
             inner = inner.clamp(float(low) + INSIDE, float(high) - INSIDE)
-        return self.constraint.inverse_transform(inner.expand(self.raw.shape[0], 1, 1, -1).reshape(self.raw.shape))
+        return self.constraint.inverse_transform(
+            inner.expand(self.raw.shape[0], 1, 1, -1).reshape(self.raw.shape)
+        )
 
     @property
     def medians(self) -> Tensor:
@@ -90,7 +99,7 @@ class Entry:
         return torch.tensor([spec.log_sd for spec in self.specs], dtype=self.raw.dtype)
 
 
-class ForceModel(gpytorch.Module):  # type: ignore[misc]
+class ForceModel(gpytorch.Module):
     """Kernel, prior mean and noise of the force, with its hyperparameters listed.
 
     Batch shape of every hyperparameter is `(axes, 1)`: one value an axis, shared by groups.
@@ -165,7 +174,9 @@ def build_force_model(config: Config, features: FeatureMap) -> ForceModel:
             model.residual.sd, batch, dims,
         )  # fmt: skip
         if model.residual.offset_sd is not None:
-            offset = StationaryKernel(num_dims=0, batch_shape=batch, sd_prior=_prior(model.residual.offset_sd))
+            offset = StationaryKernel(
+                num_dims=0, batch_shape=batch, sd_prior=_prior(model.residual.offset_sd)
+            )
             residual = AdditiveKernel(residual, offset)
     layout: InputLayout = features.layout
     kernel = InteractionKernel(ImpedanceKernel(layout, trajectory, stiffness, damping, mass), residual)
@@ -247,7 +258,7 @@ def _impedance(prior: ImpedancePrior, features: FeatureMap, batch: torch.Size) -
         sd_constraint=Interval(0.0, LARGEST_LOG_SD) if learned_log_sd else None,
         lengthscale_prior=_prior(*specs) if specs else None,
     )
-    law = "log_gaussian" if prior.prior == "log_gp" else "gaussian"
+    law: Law = "log_gaussian" if prior.prior == "log_gp" else "gaussian"
     return ImpedanceProcess(covariance, law, level_prior=_prior(prior.level), batch_shape=batch)
 
 
@@ -272,9 +283,7 @@ def _length_scale_specs(
     length_scale: LengthScales, components: Sequence[str], features: FeatureMap
 ) -> list[Hyperparameter]:
     return [
-        getattr(length_scale, component)
-        for component in components
-        for _ in features.labels([component])
+        getattr(length_scale, component) for component in components for _ in features.labels([component])
     ]
 
 
@@ -321,4 +330,6 @@ def _residual_entries(
 def _noise_entry(force_model: ForceModel, config: Config) -> Entry:
     noise = force_model.likelihood.noise_covar
     spec = config.model.noise_sd
-    return Entry("noise_sd", "N", ("",), (spec,), noise.raw_noise, noise.raw_noise_constraint, ("N",), power=0.5)
+    return Entry(
+        "noise_sd", "N", ("",), (spec,), noise.raw_noise, noise.raw_noise_constraint, ("N",), power=0.5
+    )

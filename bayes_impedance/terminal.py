@@ -81,7 +81,9 @@ def hyperparameter_table(model: ImpedanceModel) -> Table:
     return table
 
 
-def _hyperparameter_row(entry: Entry, c: int, label: str, a: int, axis: str, model: ImpedanceModel) -> list[str]:
+def _hyperparameter_row(
+    entry: Entry, c: int, label: str, a: int, axis: str, model: ImpedanceModel
+) -> list[str]:
     spec = entry.specs[c]
     name = f"{entry.name} {label}".strip()
     value = float(entry.value[a, 0, 0, c].detach())
@@ -103,10 +105,20 @@ def restart_table(model: ImpedanceModel) -> Table:
     """How every restart ended."""
     report = model.report
     table = Table(title="Restarts of the optimiser", title_justify="left")
-    for name in ("restart", "log posterior", "log likelihood", "iterations", "evaluations", "seconds", "outcome"):
+    for name in (
+        "restart",
+        "log posterior",
+        "log likelihood",
+        "iterations",
+        "evaluations",
+        "seconds",
+        "outcome",
+    ):
         table.add_column(name, justify="left" if name == "outcome" else "right")
     for r in report.restarts:
-        best = [axis for axis, index in zip(model.fitted.log.axes, report.best, strict=True) if index == r.restart]
+        best = [
+            axis for axis, index in zip(model.fitted.log.axes, report.best, strict=True) if index == r.restart
+        ]
         outcome = r.outcome.lower() + (f"; best for {', '.join(best)}" if best else "")
         table.add_row(
             str(r.restart), _values(r.objective), _values(r.log_likelihood), str(r.iterations),

@@ -105,14 +105,18 @@ def train(
         search.begin(restart, progress)
         clock = time.perf_counter()
         try:
-            result = minimize(
+            result = minimize(  # type: ignore[call-overload] # the stubs know no bounds as a list of pairs with a callback
                 search,
                 start,
                 jac=True,
                 method="L-BFGS-B",
                 bounds=search.bounds,
                 callback=search.report,
-                options={"maxiter": config.max_iterations, "gtol": config.gradient_tolerance, "ftol": RELATIVE_TOLERANCE},
+                options={
+                    "maxiter": config.max_iterations,
+                    "gtol": config.gradient_tolerance,
+                    "ftol": RELATIVE_TOLERANCE,
+                },
             )
             outcome = str(result.message)
         except NotPositiveDefiniteError as error:

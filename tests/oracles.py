@@ -27,7 +27,8 @@ IMPEDANCE = ("stiffness", "damping", "mass")
 
 def relative_error(value: Tensor, expected: Tensor) -> float:
     """Largest deviation over the largest entry expected."""
-    return float((value - expected).abs().max() / expected.abs().max().clamp_min(1e-300))
+    deviation = (value - expected).detach().abs().max()
+    return float(deviation / expected.detach().abs().max().clamp_min(1e-300))
 
 
 def double(value: float | Sequence[float]) -> Tensor:

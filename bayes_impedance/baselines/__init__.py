@@ -1,0 +1,1 @@
+"""What people use otherwise, on the same log."""

@@ -1,0 +1,1 @@
+"""Inference engines: exact likelihoods and the factors that posteriors are computed from."""

@@ -107,7 +107,7 @@ class _LogMarginalLikelihood(torch.autograd.Function):
         return -0.5 * ((masked * alpha).sum(-1) + log_det + count * math.log(2.0 * math.pi))
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
         kernel, observations = ctx.kernel, ctx.observations
         cholesky, alpha = ctx.saved_tensors
         valid = observations.valid
@@ -127,7 +127,9 @@ class _LogMarginalLikelihood(torch.autograd.Function):
             block_weight[..., :start].mul_(2.0)
             with torch.enable_grad():
                 block = _block(kernel, observations.inputs, start, stop)
-                parts = torch.autograd.grad(block, parameters, block_weight.expand_as(block), allow_unused=True)
+                parts = torch.autograd.grad(
+                    block, parameters, block_weight.expand_as(block), allow_unused=True
+                )
             for total, part in zip(gradients, parts, strict=True):
                 if part is not None:
                     total.add_(part)

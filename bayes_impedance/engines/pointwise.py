@@ -97,7 +97,14 @@ class _Trajectory:
         weighted = self.theta * self.precision
         p = len(self.precision)
         self.slices = {name: slice(k * p, (k + 1) * p) for k, name in enumerate(("theta", "a", "b"))}
-        columns = [self.theta, a, b, (a * weighted).sum(1), (b * weighted).sum(1), (a * self.precision * a).sum(1)]
+        columns = [
+            self.theta,
+            a,
+            b,
+            (a * weighted).sum(1),
+            (b * weighted).sum(1),
+            (a * self.precision * a).sum(1),
+        ]
         columns.append(np.ones(len(inputs)))
         self.kept = np.column_stack(columns).T.copy()
         self.last = 3 * p
@@ -126,8 +133,8 @@ class _Trajectory:
     def own(self, x: Array) -> tuple[Any, list[list[Any]]]:
         """The same at the sample itself."""
         _, a, b = self._path(x)
-        aa, ab, bb = a @ (self.precision * a), a @ (self.precision * b), b @ (self.precision * b)
-        aa, ab, bb = float(aa), float(ab), float(bb)
+        weighted = self.precision * b
+        aa, ab, bb = float(a @ (self.precision * a)), float(a @ weighted), float(b @ weighted)
         third = (-ab, -ab, -bb) if self.has_acceleration else (None, None, None)
         forms = Forms(0.0, 0.0, 0.0, -aa, aa, aa, *third)
         if self.profile.is_exponential:

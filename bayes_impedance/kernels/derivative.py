@@ -126,7 +126,9 @@ def _table_exponential(forms: Forms, order: int) -> Table:
     k22 = multiply_add(k20 * k02, s11, multiply_add(s11, s10, s01, value=-2.0), value=2.0)
     if forms.s21 is not None and forms.s12 is not None and forms.s22 is not None:
         k21, k12 = k21 - forms.s21, k12 - forms.s12
-        k22 = multiply_add(multiply_add(k22, s10, forms.s12, value=2.0), s01, forms.s21, value=2.0) - forms.s22
+        k22 = (
+            multiply_add(multiply_add(k22, s10, forms.s12, value=2.0), s01, forms.s21, value=2.0) - forms.s22
+        )
     return [[k00, k01, k02], [k10, k11, k12], [k20, k21, k22]]
 
 

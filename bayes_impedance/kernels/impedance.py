@@ -154,7 +154,9 @@ class ImpedanceKernel(Kernel):
     @property
     def processes(self) -> tuple[ImpedanceProcess, ...]:
         """(k, d, m), or (k, d) without mass; their place is the order of the error they multiply."""
-        return (self.stiffness, self.damping) if self.mass is None else (self.stiffness, self.damping, self.mass)
+        return (
+            (self.stiffness, self.damping) if self.mass is None else (self.stiffness, self.damping, self.mass)
+        )
 
     @property
     def order(self) -> int:
@@ -223,7 +225,10 @@ class ImpedanceKernel(Kernel):
 
     def _trajectory_table(self, x1: Tensor, x2: Tensor, order: int | None = None) -> tuple[Tensor, Table]:
         common, table = derivative_table(
-            self.trajectory, self.layout.path(x1), self.layout.path(x2), self.order if order is None else order
+            self.trajectory,
+            self.layout.path(x1),
+            self.layout.path(x2),
+            self.order if order is None else order,
         )
         shared = same_label(x1, x2, self.layout.trajectory)
         return common if shared is None else common * shared, table

@@ -220,9 +220,7 @@ class StationaryKernel(Kernel):
         """σ² κ(s), `(..., n1, n2)`, or `(..., n)` with `diag`."""
         variance = self.sd**2
         if diag:
-            return variance[..., 0].expand(
-                torch.broadcast_shapes(x1.shape[:-1], (*variance.shape[:-2], 1))
-            )
+            return variance[..., 0].expand(torch.broadcast_shapes(x1.shape[:-1], (*variance.shape[:-2], 1)))
         if not self.has_lengthscale:
             rows = torch.broadcast_shapes(x1.shape[:-2], x2.shape[:-2], variance.shape[:-2])
             return variance.expand(*rows, x1.shape[-2], x2.shape[-2])

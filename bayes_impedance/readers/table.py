@@ -37,7 +37,7 @@ MISSING = ("", "nan", "NaN", "NAN", "NA", "N/A", "n/a", "null", "NULL", "None", 
 _OLD = tuple(int(part) for part in pd.__version__.split(".")[:2]) < (3, 1)
 EXACT: dict[str, Any] = {"float_precision": "round_trip"} if _OLD else {}
 #: What pandas and Arrow raise at a file that is not what it claims to be.
-UNREADABLE = (OSError, ValueError, pa.ArrowException)  # type: ignore[attr-defined]
+UNREADABLE = (OSError, ValueError, pa.ArrowException)
 
 
 def read_log(
@@ -200,7 +200,7 @@ def _cells(line: str, delimiter: str, source: str) -> list[str]:
 
 
 def _parquet(file: Path) -> pq.ParquetFile:
-    return pq.ParquetFile(file)  # type: ignore[no-untyped-call]
+    return pq.ParquetFile(file)
 
 
 def _open_parquet(file: Path, source: str) -> _Table:

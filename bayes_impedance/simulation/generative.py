@@ -86,9 +86,7 @@ def draw_force(
     features = feature_map(motion, mean)
     model = build_force_model(config, feature_map) if force_model is None else force_model
     with torch.no_grad():
-        drawn = {
-            group: _draw_group(model, features, g, generator) for g, group in enumerate(features.groups)
-        }
+        drawn = {group: _draw_group(model, features, g, generator) for g, group in enumerate(features.groups)}
     trials = []
     counts = dict.fromkeys(features.groups, 0)
     for trial in motion.trials:
@@ -137,7 +135,9 @@ def _draw_group(
     common = common if shared is None else common * shared
     rows = [torch.cat([(common * table[i][j]).expand_as(common) for j in range(3)], dim=-1) for i in range(3)]
     deviation = _sample(torch.cat(rows, dim=-2), generator)
-    desired = features.trajectory_mean[:, group : group + 1, :n] + torch.stack(deviation.split(n, dim=-1), dim=-1)
+    desired = features.trajectory_mean[:, group : group + 1, :n] + torch.stack(
+        deviation.split(n, dim=-1), dim=-1
+    )
     columns = []
     for process in impedance.processes:
         draw = _sample(process.gaussian_covariance(x, x), generator)
@@ -159,7 +159,9 @@ def _sample(covariance: Tensor, generator: torch.Generator) -> Tensor:
     standard = torch.randn(scale.shape, generator=generator, dtype=scale.dtype)
     drawn = [
         _factor(c) @ z
-        for c, z in zip(correlation.reshape(-1, *correlation.shape[-2:]), standard.flatten(0, -2), strict=True)
+        for c, z in zip(
+            correlation.reshape(-1, *correlation.shape[-2:]), standard.flatten(0, -2), strict=True
+        )
     ]
     return scale * torch.stack(drawn).reshape(scale.shape)
 

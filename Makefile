@@ -1,0 +1,53 @@
+# make demo — the main job, end to end.   make test — lint, types, tests, notebooks.
+# Both set up their own environment in .venv the first time.
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+SOURCES := bayes_impedance tests benchmarks
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint types format bench results hooks clean
+
+help:
+	@sed -n '1,2p' Makefile; echo "also: lint types format bench results hooks clean"
+
+$(INSTALLED): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "expected Python 3.11 or newer, found $$($(PYTHON) --version); set PYTHON=/path/to/python3.11"; exit 2; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt torch==2.13.0
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+demo: $(INSTALLED)
+	$(BIN)/bayes-impedance demo --out demo
+
+test: lint types
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check $(SOURCES)
+	$(BIN)/ruff format --check $(SOURCES)
+
+types: $(INSTALLED)
+	$(BIN)/mypy
+
+format: $(INSTALLED)
+	$(BIN)/ruff check --fix $(SOURCES)
+	$(BIN)/ruff format $(SOURCES)
+
+# Times, each beside its competitor in the same run; writes benchmarks/results.json.
+bench: $(INSTALLED)
+	$(BIN)/python -m pytest benchmarks --benchmark-disable-gc -q -p no:cacheprovider -n 0
+
+# The figures quoted in the README and the notebooks; writes results/core.json.
+results: $(INSTALLED)
+	$(BIN)/python -m benchmarks.core_results
+
+hooks: $(INSTALLED)
+	$(BIN)/pre-commit install
+
+clean:
+	rm -rf $(VENV) build dist demo .pytest_cache .mypy_cache .ruff_cache .hypothesis
