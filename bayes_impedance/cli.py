@@ -7,9 +7,10 @@ import sys
 import warnings
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, NoReturn
 
 import typer
+import typer.core
 from rich.console import Console
 from rich.markup import escape
 
@@ -28,8 +29,21 @@ from bayes_impedance.readers import read_log
 
 BAD_INPUT, INTERRUPTED = 2, 130
 
+
+class _Commands(typer.core.TyperGroup):
+    """Ctrl-C ends in a sentence, which typer leaves out."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            _errors().print("interrupted; no file was left half written", highlight=False)
+            raise typer.Exit(INTERRUPTED) from None
+
+
 app = typer.Typer(
     name="bayes-impedance",
+    cls=_Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
@@ -69,11 +83,9 @@ def main() -> None:
     try:
         app()
     except BayesImpedanceError as error:
-        _errors().print(f"[bold red]error:[/bold red] {escape(str(error))}", highlight=False, soft_wrap=True)
-        sys.exit(BAD_INPUT)
-    except KeyboardInterrupt:
-        _errors().print("interrupted; nothing was written")
-        sys.exit(INTERRUPTED)
+        _refuse(str(error))
+    except OSError as error:
+        _refuse(f"{error.filename or 'a file'}: could not be used: {error.strerror or error}")
 
 
 @app.callback(invoke_without_command=True)
@@ -184,11 +196,12 @@ def infer(
     trained = load_model(model)
     log = read_log(logs, trained.config.log, require_force=given is Given.log)
     posterior = trained.posterior(log, given.value)
+    if figures is not None:
+        prepare_folder(figures)
     _write_posterior(posterior, out)
     verdicts = terminal.print_verdicts(console, trained, posterior)
     console.print(f"wrote {out}", highlight=False, soft_wrap=True)
     if figures is not None:
-        prepare_folder(figures)
         for path in save_figures(posterior, verdicts, figures):
             console.print(f"wrote {path}", highlight=False, soft_wrap=True)
 
@@ -257,6 +270,11 @@ def _write_posterior(posterior: Posterior, path: Path) -> None:
             table.to_csv(temporary, index=False)
         else:
             table.to_parquet(temporary, index=False)
+
+
+def _refuse(message: str) -> NoReturn:
+    _errors().print(f"[bold red]error:[/bold red] {escape(message)}", highlight=False, soft_wrap=True)
+    sys.exit(BAD_INPUT)
 
 
 def _errors() -> Console:

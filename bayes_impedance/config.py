@@ -28,6 +28,9 @@ ProfileName = Literal["squared_exponential", "rational_quadratic", "matern52", "
 #: (kurtosis 3 exp(4 s²)) that a Gaussian with the same two moments misleads.
 LARGEST_LOG_SD = 0.5
 
+#: What PyYAML raises at a text that it cannot turn into values (13 months, a thousand brackets).
+UNREADABLE = (yaml.YAMLError, ValueError, RecursionError)
+
 
 class Section(BaseModel):
     """Base of every section: immutable, no unknown keys, no infinities."""
@@ -48,6 +51,12 @@ class Hyperparameter(Section):
 
 
 def _number_means_fixed(value: Any) -> Any:
+    if isinstance(value, str):
+        # YAML 1.1 reads 1e-3, without a point, as text.
+        try:
+            value = float(value)
+        except ValueError:
+            return value
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         return {"median": value, "fixed": True}
     return value
@@ -305,7 +314,6 @@ class EngineConfig(Section):
     name: Literal["dense"] = "dense"
     max_samples: int = Field(default=4000, ge=2)
     jitter: float = Field(default=1e-10, ge=0, le=1e-3)
-    block_rows: int = Field(default=64, ge=1)
 
 
 class TrainingConfig(Section):
@@ -368,7 +376,7 @@ def load_config(source: str | Path, overrides: Iterable[str] = ()) -> Config:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{path}: expected a readable UTF-8 YAML file, got: {error}") from error
-    except yaml.YAMLError as error:
+    except UNREADABLE as error:
         raise ConfigurationError(f"{path}: expected YAML, got: {_one_line(error)}") from error
     return parse_config({} if content is None else content, str(path), overrides)
 
@@ -381,9 +389,14 @@ def parse_config(content: Any, where: str = "configuration", overrides: Iterable
     if not isinstance(content, Mapping):
         raise ConfigurationError(f"{where}: expected a mapping of sections, got {type(content).__name__}")
     config = _validate(content, where)
-    for override in overrides:
-        config = _validate(_override(config.model_dump(mode="json"), override), f"--set {override}")
-    return config
+    assignments = list(overrides)
+    if not assignments:
+        return config
+    changed = config.model_dump(mode="json")
+    for assignment in assignments:
+        changed = _override(changed, assignment)
+    # All at once: prior=gp and its sd, say, are only valid together.
+    return _validate(changed, " ".join(f"--set {assignment}" for assignment in assignments))
 
 
 def _validate(content: Mapping[str, Any], where: str) -> Config:
@@ -406,7 +419,7 @@ def _override(content: dict[str, Any], assignment: str) -> dict[str, Any]:
         raise ConfigurationError(f"--set: expected KEY=VALUE such as training.restarts=5, got {assignment!r}")
     try:
         value = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    except UNREADABLE as error:
         raise ConfigurationError(f"--set {key}: expected a YAML value, got {text!r}") from error
     level = content
     for part in parts[:-1]:
@@ -432,6 +445,9 @@ def _explain(error: ValidationError) -> str:
         return f"unknown key '{key}'; {hint}"
     if problem["type"] == "missing":
         return f"missing key '{key}'"
+    if problem["type"] == "model_type":
+        number = "a number or " if problem["ctx"]["class_name"] == Hyperparameter.__name__ else ""
+        return f"{key}: expected {number}a mapping of keys to values, got {problem['input']!r}"
     message = re.sub(r"^Value error, ", "", problem["msg"])
     message = message[:1].lower() + message[1:]
     if problem["type"] == "value_error":

@@ -104,5 +104,5 @@ def prepare_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(
-            f"{folder}: could not be created: {error.strerror}; choose another --out"
+            f"{folder}: could not be created: {error.strerror}; choose another place"
         ) from error

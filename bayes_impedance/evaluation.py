@@ -45,7 +45,11 @@ def evaluate(
         )
     predictions = {"impedance": model.posterior(prepared, given="training", latents=[Latent.FORCE])}
     if naive:
-        predictions["naive"] = NaiveModel(model.config, training, progress).predict(prepared)
+        competitor = NaiveModel(model.config, training, progress)
+        if competitor.report.interrupted:
+            # Half trained it would be no fair competitor.
+            raise KeyboardInterrupt
+        predictions["naive"] = competitor.predict(prepared)
     return {
         axis: {name: _scores(posterior, training, a) for name, posterior in predictions.items()}
         for a, axis in enumerate(prepared.axes)

@@ -18,7 +18,7 @@ def check_writable(path: Path) -> None:
     Raises:
         OutputError: the parent folder is missing, or not writable.
     """
-    parent = path.absolute().parent
+    parent = path.resolve().parent
     if not parent.is_dir():
         raise OutputError(
             f"{path}: expected an existing folder {parent} to write into, found none; create it"
@@ -42,13 +42,17 @@ def whole_file(path: Path) -> Iterator[Path]:
     check_writable(path)
     if path.is_dir():
         raise OutputError(f"{path}: expected a file name to write to, found a folder; name a file in it")
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.absolute().parent)
+    if path.exists() and not path.is_file():
+        # Renaming over /dev/null would remove it.
+        raise OutputError(f"{path}: expected a file name to write to, found a device or pipe; name a file")
+    target = path.resolve()
+    handle, name = tempfile.mkstemp(prefix=f".{target.stem}-", suffix=target.suffix, dir=target.parent)
     os.close(handle)
     temporary = Path(name)
     try:
         yield temporary
         temporary.chmod(0o666 & ~_umask())
-        temporary.replace(path)
+        temporary.replace(target)
     except OSError as error:
         raise OutputError(f"{path}: could not be written: {error.strerror or error}") from error
     finally:
@@ -66,7 +70,7 @@ def whole_folder(path: Path, marker: str) -> Iterator[Path]:
     """
     check_writable(path)
     check_replaceable(path, marker)
-    target = path.absolute()
+    target = path.resolve()
     temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
     replaced = temporary.with_name(f"{temporary.name}.old")
     try:
@@ -76,11 +80,11 @@ def whole_folder(path: Path, marker: str) -> Iterator[Path]:
             target.rename(replaced)
         temporary.rename(target)
     except OSError as error:
-        # The old folder goes back to its place: nothing is lost.
-        if replaced.is_dir() and not target.exists():
-            replaced.rename(target)
         raise OutputError(f"{path}: could not be written: {error.strerror or error}") from error
     finally:
+        # Whatever came between the two renamings, Ctrl-C included: the old folder goes back to its place.
+        if replaced.is_dir() and not target.exists():
+            replaced.rename(target)
         shutil.rmtree(temporary, ignore_errors=True)
         shutil.rmtree(replaced, ignore_errors=True)
 

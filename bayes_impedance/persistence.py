@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file, save
 
 from bayes_impedance.config import dump_config, load_config
 from bayes_impedance.errors import BayesImpedanceError, ModelFolderError
@@ -46,10 +46,10 @@ def save_model(model: ImpedanceModel, folder: str | Path) -> None:
     with whole_folder(Path(folder), METADATA) as place:
         (place / "config.yaml").write_text(dump_config(model.config), encoding="utf-8")
         tensors = {entry.name: entry.raw.detach().numpy() for entry in fit.force_model.entries}
-        save_file(tensors, place / "hyperparameters.safetensors")
-        save_file(
-            {k: np.ascontiguousarray(v) for k, v in fit.log.arrays().items()}, place / "data.safetensors"
-        )
+        arrays = {name: np.ascontiguousarray(values) for name, values in fit.log.arrays().items()}
+        # Not save_file: a full disk is no OSError there.
+        (place / "hyperparameters.safetensors").write_bytes(save(tensors))
+        (place / "data.safetensors").write_bytes(save(arrays))
         metadata = {
             "schema_version": SCHEMA_VERSION,
             "package_version": version("bayes-impedance"),
@@ -92,11 +92,16 @@ def load_model(folder: str | Path) -> ImpedanceModel:
 def _assemble(place: Path, metadata: Mapping[str, Any]) -> ImpedanceModel:
     config = load_config(place / "config.yaml")
     log = PreparedLog.from_arrays(metadata["log"], load_file(place / "data.safetensors"))
+    if log.fingerprint() != metadata["data_fingerprint"]:
+        raise ValueError("other names, groups or axes than those that were trained on")
     force_model = build_force_model(config, FeatureMap(config, log.axes))
     tensors = load_file(place / "hyperparameters.safetensors")
     for entry in force_model.entries:
+        stored = torch.from_numpy(tensors[entry.name])
+        if stored.shape != entry.raw.shape or stored.dtype != entry.raw.dtype:
+            raise ValueError(f"{entry.name} of another shape or type")
         with torch.no_grad():
-            entry.raw.copy_(torch.from_numpy(tensors[entry.name]))
+            entry.raw.copy_(stored)
     report: dict[str, Any] = metadata["report"]
     restarts = tuple(
         RestartReport(**{**item, **{k: tuple(item[k]) for k in ("objective", "log_likelihood")}})
@@ -123,7 +128,7 @@ def _metadata(place: Path) -> dict[str, Any]:
         metadata = json.loads((place / METADATA).read_text(encoding="utf-8"))
         schema = int(metadata["schema_version"])
         files = dict(metadata["files"])
-    except (OSError, UnicodeDecodeError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise ModelFolderError(
             f"{place / METADATA}: expected the JSON that training wrote, found it truncated or changed ({error}); "
             "copy the whole folder again, or train again"

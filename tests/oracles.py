@@ -36,6 +36,11 @@ def double(value: float | Sequence[float]) -> Tensor:
     return torch.tensor(value, dtype=torch.float64)
 
 
+def number(value: Tensor) -> float:
+    """A one-element tensor as a number, outside the graph."""
+    return float(value.detach())
+
+
 # --- covariances of one pair -------------------------------------------------------------------------
 
 

@@ -115,7 +115,7 @@ def test_prior_only_under_equilibrium_names_the_product() -> None:
     config = configuration(trajectory_input="position", desired_trajectory=EQUILIBRIUM)
     sentence = stiffness_of(posterior_with(0.0), config).sentence
     assert sentence.startswith("stiffness xx: prior only; the data removed 0 % of the prior variance: ")
-    assert "product of impedance and the desired trajectory's SD" in sentence
+    assert "the force tells only the product of impedance and the SD of x_d" in sentence
     # Rounding may make the posterior a hair wider than the prior; nobody wants to read "-0 %".
     assert "removed 0 %" in stiffness_of(posterior_with(-1e-12), config).sentence
 

@@ -7,6 +7,8 @@ are one small matrix times a matrix kept from training.
 
 from __future__ import annotations
 
+import copy
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -49,32 +51,40 @@ class PointPredictor:
         impedance = kernel.impedance
         self._layout = impedance.layout
         self._trajectory = _Trajectory(kernel, inputs)
-        self._processes = [_Process(process, inputs) for process in impedance.processes]
-        self._residual = [_Stationary(part, inputs) for part in _parts(kernel.residual)]
+        width = inputs.shape[1]
+        impedance_parts = [_Stationary(process.covariance, width) for process in impedance.processes]
+        residual_parts = [_Stationary(part, width) for part in _parts(kernel.residual)]
+        self._rows = _Rows([*impedance_parts, *residual_parts], inputs)
+        self._processes = [
+            _Process(process, part.variance)
+            for process, part in zip(impedance.processes, impedance_parts, strict=True)
+        ]
+        self._expectations = [process.expectation for process in self._processes]
+        self._variances = {(j, j): process.variance for j, process in enumerate(self._processes)}
+        self._residual_variance = sum(part.variance for part in residual_parts)
         self._labels = None if self._layout.residual is None else inputs[:, self._layout.residual]
         self._errors = [inputs[:, c] for c in self._layout.error] or None
 
     def predict(self, x: Array) -> tuple[float, float]:
         """E and Var of a new measurement of force [N, N²] at the inputs `x` `(D,)`, levels taken as known."""
         common, table = self._trajectory.table(x)
-        moments = [process.moments(x) for process in self._processes]
-        errors = [x[c] for c in self._layout.error] or None
-        covariance = {(j, j): c for j, (_, _, c, _) in enumerate(moments)}
-        here, there = [m[0] for m in moments], [m[1] for m in moments]
-        cross = force_covariance(here, there, covariance, table, common, errors, self._errors)
-        prior = 0.0
-        if self._residual:
-            residual = sum(part.row(x) for part in self._residual)
-            same = self._labels is None or self._labels == x[self._layout.residual]
-            cross = cross + residual * same
-            prior = sum(part.variance for part in self._residual)
+        rows = self._rows(x)
+        count = len(self._processes)
+        covariance = {(j, j): process.covariance(rows[j]) for j, process in enumerate(self._processes)}
+        errors = [float(x[c]) for c in self._layout.error] or None
+        weights = self._expectations
+        cross = force_covariance(weights, weights, covariance, table, common, errors, self._errors)
+        for row in rows[count:]:
+            cross = cross + (
+                row if self._labels is None else row * (self._labels == x[self._layout.residual])
+            )
         own, own_table = self._trajectory.own(x)
-        variances = {(j, j): v for j, (_, _, _, v) in enumerate(moments)}
-        prior += force_covariance(here, here, variances, own_table, own, errors, errors)
+        prior = self._residual_variance
+        prior += force_covariance(weights, weights, self._variances, own_table, own, errors, errors)
         white = self._inverse @ cross
         mean = cross @ self._alpha
         if errors is not None:
-            mean += sum(e * w for e, w in zip(errors, here, strict=True))
+            mean += sum(e * w for e, w in zip(errors, weights, strict=True))
         return float(mean), float(max(prior - white @ white, 0.0) + self._noise)
 
 
@@ -97,33 +107,29 @@ class _Trajectory:
         weighted = self.theta * self.precision
         p = len(self.precision)
         self.slices = {name: slice(k * p, (k + 1) * p) for k, name in enumerate(("theta", "a", "b"))}
-        columns = [
-            self.theta,
-            a,
-            b,
-            (a * weighted).sum(1),
-            (b * weighted).sum(1),
-            (a * self.precision * a).sum(1),
-        ]
-        columns.append(np.ones(len(inputs)))
+        speed = (a * self.precision * a).sum(1)
+        half = 0.5 * (self.theta * weighted).sum(1)
+        turned = [(a * weighted).sum(1), (b * weighted).sum(1)]
+        columns = [self.theta, a, b, *turned, speed, np.ones(len(inputs)), half]
         self.kept = np.column_stack(columns).T.copy()
         self.last = 3 * p
-        self.coefficients = np.zeros((8, len(self.kept)))
+        self.coefficients = np.zeros((9, len(self.kept)))
 
     def table(self, x: Array) -> tuple[Array, list[list[Any]]]:
         theta, a, b = self._path(x)
         pt, pa, pb = self.precision * theta, self.precision * a, self.precision * b
         c, s, end = self.coefficients, self.slices, self.last
-        # Rows: s10, s01, s11, s20, s02, s21, s12, s22; columns: θ', a', b', a'ᵀPθ', b'ᵀPθ', A', 1.
+        # Rows: s10, s01, s11, s20, s02, s21, s12, s22, s; columns: θ', a', b', a'ᵀPθ', b'ᵀPθ', A', 1, ½θ'ᵀPθ'.
         c[0, s["theta"]], c[0, end + 3] = -pa, a @ pt
         c[1, s["a"]], c[1, end] = -pt, 1.0
         c[2, s["a"]] = -pa
         c[3, s["theta"]], c[3, end + 3] = -pb, a @ pa + b @ pt
         c[4, s["b"]], c[4, end + 1], c[4, end + 2] = -pt, 1.0, 1.0
         c[5, s["a"]], c[6, s["b"]], c[7, s["b"]] = -pb, -pa, -pb
-        s10, s01, s11, s20, s02, s21, s12, s22 = c @ self.kept
-        r = theta - self.theta
-        half = 0.5 * ((r * r) @ self.precision)
+        c[8, s["theta"]], c[8, end + 3], c[8, end + 4] = -pt, 0.5 * (theta @ pt), 1.0
+        s10, s01, s11, s20, s02, s21, s12, s22, half = c @ self.kept
+        if self.profile.exact_distance:
+            half = 0.5 * (theta - self.theta) ** 2 @ self.precision
         third = (s21, s12, s22) if self.has_acceleration else (None, None, None)
         common, table = self._combine(Forms(half, s10, s01, s11, s20, s02, *third))
         if self.labels is not None:
@@ -144,7 +150,7 @@ class _Trajectory:
     def _combine(self, forms: Forms) -> tuple[Any, list[list[Any]]]:
         if self.profile.is_exponential:
             return self.variance * np.exp(-forms.s), combine(self.profile, forms, (), self.order)
-        common, ratios = self.profile.derivatives(torch.as_tensor(forms.s), self.shape)
+        common, ratios = self.profile.derivatives(torch.as_tensor(forms.s, dtype=torch.float64), self.shape)
         plain = tuple(ratio.numpy() if isinstance(ratio, Tensor) else ratio for ratio in ratios)
         return self.variance * common.numpy(), combine(self.profile, forms, plain, self.order)
 
@@ -155,46 +161,59 @@ class _Trajectory:
 
 
 class _Stationary:
-    """A covariance between one sample and the training samples."""
+    """Hyperparameters of a covariance over ξ."""
 
-    def __init__(self, kernel: Kernel, inputs: Array) -> None:
+    def __init__(self, kernel: Kernel, width: int) -> None:
         _check(kernel)
         self.profile = kernel.profile
         self.variance = float(kernel.sd.detach() ** 2)
         self.shape = None if kernel.shape is None else kernel.shape.detach().reshape(())
-        self.constant = kernel.num_dims == 0
-        if not self.constant:
-            self.dims = slice(None) if kernel.active_dims is None else _columns(kernel.active_dims.tolist())
-            self.inputs = inputs[:, self.dims]
-            self.half_precision = 0.5 * _scalar_row(kernel.precision, self.inputs.shape[1])
+        every = tuple(range(width)) if kernel.active_dims is None else tuple(kernel.active_dims.tolist())
+        self.dims = every if kernel.num_dims else ()
+        self.half_precision = (
+            0.5 * _scalar_row(kernel.precision, len(self.dims)) if self.dims else np.zeros(0)
+        )
 
-    def row(self, x: Array) -> Any:
-        if self.constant:
-            return self.variance
-        r = x[self.dims] - self.inputs
-        s = (r * r) @ self.half_precision
+    def from_distance(self, s: Array) -> Array:
         if self.profile.is_exponential:
             return self.variance * np.exp(-s)
         return self.variance * self.profile.value(torch.from_numpy(s), self.shape).numpy()
 
 
+class _Rows:
+    """All covariances over ξ between one sample and the training samples; those with equal ξ share r²."""
+
+    def __init__(self, parts: Sequence[_Stationary], inputs: Array) -> None:
+        self.parts = parts
+        self.groups = []
+        for dims in dict.fromkeys(part.dims for part in parts if part.dims):
+            members = [k for k, part in enumerate(parts) if part.dims == dims]
+            index = _columns(dims)
+            weights = np.stack([parts[k].half_precision for k in members])
+            self.groups.append((members, index, inputs[:, index].T.copy(), weights))
+
+    def __call__(self, x: Array) -> list[Any]:
+        rows: list[Any] = [part.variance for part in self.parts]
+        for members, index, inputs, weights in self.groups:
+            r = inputs - x[index, None]
+            distances = weights @ (r * r)
+            for k, s in zip(members, distances, strict=True):
+                rows[k] = self.parts[k].from_distance(s)
+        return rows
+
+
 class _Process:
-    """Moments of k, d or m between one sample and the training samples."""
+    """Moments of k, d or m; stationary, so that the expectation is one number."""
 
-    def __init__(self, process: ImpedanceProcess, inputs: Array) -> None:
+    def __init__(self, process: ImpedanceProcess, variance: float) -> None:
         self.gaussian = process.law == "gaussian"
-        self.covariance = _Stationary(process.covariance, inputs)
-        variance = self.covariance.variance
         level = float(process.level.detach())
-        # Stationary, so the expectation is one number.
-        self.expectation = level if self.gaussian else level * np.exp(0.5 * variance)
-        self.variance = variance if self.gaussian else self.expectation**2 * np.expm1(variance)
+        self.expectation = level if self.gaussian else level * math.exp(0.5 * variance)
+        self.variance = variance if self.gaussian else self.expectation**2 * math.expm1(variance)
 
-    def moments(self, x: Array) -> tuple[float, float, Any, float]:
-        """E[w], E[w'], Cov[w, w'], Var[w]."""
-        k = self.covariance.row(x)
-        covariance = k if self.gaussian else self.expectation**2 * np.expm1(k)
-        return self.expectation, self.expectation, covariance, self.variance
+    def covariance(self, k: Any) -> Any:
+        """Cov[w, w'] from k_w."""
+        return k if self.gaussian else self.expectation**2 * np.expm1(k)
 
 
 def _columns(columns: Sequence[int]) -> Any:
@@ -203,6 +222,17 @@ def _columns(columns: Sequence[int]) -> Any:
     if list(columns) == list(range(first, first + count)):
         return slice(first, first + count)
     return np.array(columns)
+
+
+def single_axis(kernel: InteractionKernel, axis: int) -> InteractionKernel:
+    """The kernel of one axis out of a batch `(axes, 1)`, without batch dimensions."""
+    alone = copy.deepcopy(kernel)
+    for module in alone.modules():
+        for parameter in module.parameters(recurse=False):
+            parameter.data = parameter.data[axis, 0]
+        if isinstance(module, Kernel):
+            module.batch_shape = torch.Size()
+    return alone
 
 
 def _parts(kernel: Kernel | None) -> list[Kernel]:

@@ -74,7 +74,7 @@ def multiply_add(total: Any, a: Any, b: Any, value: float = 1.0) -> Any:
     """`total` + `value` · a · b for tensors in one pass, and for NumPy arrays, which one-point prediction uses."""
     if isinstance(total, Tensor) and isinstance(a, Tensor) and isinstance(b, Tensor):
         return torch.addcmul(total, a, b, value=value)
-    return total + value * a * b
+    return total + a * b if value == 1.0 else total + value * (a * b)
 
 
 def _table(forms: Forms, ratios: tuple[Any, ...], order: int) -> Table:

@@ -8,7 +8,7 @@ import re
 import pytest
 import torch
 from gpytorch.kernels import AdditiveKernel, Kernel
-from oracles import double
+from oracles import double, number
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
@@ -78,7 +78,7 @@ def assert_same(value: Tensor, expected: Tensor, leaves: list[Tensor]) -> None:
     theirs = torch.autograd.grad((expected * weight).sum(), leaves)
     for left, right in zip(ours, theirs, strict=True):
         assert left.shape == right.shape
-        assert float((left - right).abs().max()) <= 1e-9 * float(right.abs().max())
+        assert number((left - right).abs().max()) <= 1e-9 * number(right.abs().max())
         assert bool(right.any())
 
 
@@ -106,7 +106,7 @@ def test_axes_and_groups_together(block_entries: int, monkeypatch: pytest.Monkey
         alone.load_state_dict({name: p[a, 0] for name, p in kernel.named_parameters()}, strict=False)
         for g in range(8):
             one = log_marginal_likelihood(alone, Observations(inputs[a, g], residual[a, g], noise[a, 0]))
-            assert float(one) == pytest.approx(float(value[a, g]), rel=1e-11)
+            assert number(one) == pytest.approx(number(value[a, g]), rel=1e-11)
 
 
 @pytest.mark.parametrize("block_entries", [1, 2**17])
@@ -144,9 +144,11 @@ def test_gradient_where_only_the_noise_is_free() -> None:
 def test_jitter_is_relative_to_the_mean_prior_variance() -> None:
     kernel, (inputs, residual, noise) = make_kernel(), make_data(19)
     value = log_marginal_likelihood(kernel, Observations(inputs, residual, noise), jitter=1e-2)
-    assert float(value) == pytest.approx(float(by_autograd(kernel, inputs, residual, noise, 1e-2)), rel=1e-11)
+    assert number(value) == pytest.approx(
+        number(by_autograd(kernel, inputs, residual, noise, 1e-2)), rel=1e-11
+    )
     without = log_marginal_likelihood(kernel, Observations(inputs, residual, noise))
-    assert abs(float(value - without)) > 1e-3
+    assert abs(number(value - without)) > 1e-3
     # A force in other units: σ ten times as large, everything else as it was, shifts log p by −n log 10.
     scaled = make_kernel()
     for process in scaled.impedance.processes:
@@ -156,7 +158,7 @@ def test_jitter_is_relative_to_the_mean_prior_variance() -> None:
     for part in scaled.residual.kernels:
         part.sd = 10.0 * part.sd.detach()
     other = log_marginal_likelihood(scaled, Observations(inputs, 10.0 * residual, 100.0 * noise), jitter=1e-2)
-    assert float(other) == pytest.approx(float(value) - 19 * math.log(10.0), rel=1e-10)
+    assert number(other) == pytest.approx(number(value) - 19 * math.log(10.0), rel=1e-10)
 
 
 def test_not_positive_definite_names_jitter_and_remedy() -> None:
@@ -203,7 +205,7 @@ def test_jitter_of_a_group_does_not_depend_on_padding() -> None:
     alone = log_marginal_likelihood(
         kernel, Observations(inputs[1, :7], residual[1, :7], noise[1]), jitter=1e-3
     )
-    assert float(padded[1]) == pytest.approx(float(alone), rel=1e-12)
+    assert number(padded[1]) == pytest.approx(number(alone), rel=1e-12)
 
 
 def test_capacity() -> None:

@@ -12,6 +12,7 @@ from oracles import (
     Samples,
     TrajectorySpec,
     configuration,
+    number,
     path_derivatives,
     relative_error,
     samples_of,
@@ -198,7 +199,7 @@ def test_batched_hyperparameters_broadcast(name: str) -> None:
                 for j in range(3):
                     assert relative_error(table[i][j][a, g], alone[i][j]) < 1e-12
                     difference = diagonal[i][j].expand(3, 4, 5)[a, g] - alone_diagonal[i][j]
-                    assert float(difference.abs().max()) < 1e-12
+                    assert number(difference.abs().max()) < 1e-12
 
 
 @pytest.mark.parametrize("name", PROFILE_NAMES)

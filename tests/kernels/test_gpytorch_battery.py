@@ -12,7 +12,7 @@ from gpytorch.distributions import MultivariateNormal
 from gpytorch.kernels import Kernel
 from gpytorch.likelihoods import GaussianLikelihood
 from gpytorch.test.base_kernel_test_case import BaseKernelTestCase
-from oracles import PROFILE_NAMES, double
+from oracles import PROFILE_NAMES, double, number
 from torch import Tensor
 
 from bayes_impedance.engines.dense import Observations, log_marginal_likelihood
@@ -220,7 +220,7 @@ def test_likelihood_and_gradients_equal_the_dense_engine(residual_column: int | 
     kernel = model.covar_module
     observations = Observations(x, force - model.mean_module(x), likelihood.noise)
     value = log_marginal_likelihood(kernel, observations)
-    assert float(value) == pytest.approx(float(expected), rel=1e-10)
+    assert number(value) == pytest.approx(number(expected), rel=1e-10)
     parameters = [*kernel.parameters(), *likelihood.parameters()]
     for ours, theirs in zip(
         torch.autograd.grad(value, parameters), torch.autograd.grad(expected, parameters), strict=True
@@ -238,7 +238,7 @@ def test_training_and_prediction_in_an_exact_gp() -> None:
         loss = -exact_likelihood(model, likelihood)
         loss.backward()
         optimiser.step()
-        losses.append(float(loss))
+        losses.append(number(loss))
     assert losses[-1] < losses[0] - 1.0
     model.eval()
     likelihood.eval()
@@ -254,4 +254,4 @@ def test_training_and_prediction_in_an_exact_gp() -> None:
     # gpytorch solves with its own jitter.
     torch.testing.assert_close(predicted.mean, mean, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(predicted.variance, variance, rtol=1e-4, atol=1e-6)
-    assert float((predicted.mean - force[::3]).std()) < 0.1
+    assert number((predicted.mean - force[::3]).std()) < 0.1

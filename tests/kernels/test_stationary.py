@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from oracles import PROFILE_NAMES, TrajectorySpec, double, profile_of, relative_error
+from oracles import PROFILE_NAMES, TrajectorySpec, double, number, profile_of, relative_error
 from torch import Tensor
 
 from bayes_impedance.kernels import StationaryKernel
@@ -56,7 +56,7 @@ def test_lag_derivatives_of_matern_five_halves_at_zero() -> None:
         for i in range(3):
             for j in range(3):
                 expected = (-1) ** j * lag[i + j]
-                assert float(common * table[i][j]) == pytest.approx(expected, rel=1e-11, abs=1e-12)
+                assert number(common * table[i][j]) == pytest.approx(expected, rel=1e-11, abs=1e-12)
 
 
 def test_length_scale_of_the_paper() -> None:
@@ -134,23 +134,23 @@ def test_half_squared_distance_by_products_and_by_differences_agree() -> None:
     x1, x2 = points(8, 3), points(6, 3, seed=1)
     exact = half_squared_distance(x1, x2, precision, exact=True)
     assert relative_error(half_squared_distance(x1, x2, precision, exact=False), exact) < 1e-14
-    assert float(half_squared_distance(x1, x1, precision, exact=True).diagonal().abs().max()) == 0.0
+    assert number(half_squared_distance(x1, x1, precision, exact=True).diagonal().abs().max()) == 0.0
 
 
 def test_hyperparameters_are_kept_on_a_log_scale() -> None:
     kernel = StationaryKernel("rational_quadratic").double()
     kernel.sd, kernel.lengthscale, kernel.shape = double(0.02), double(0.3), double(1.7)
-    assert float(kernel.raw_sd) == pytest.approx(math.log(0.02))
-    assert float(kernel.raw_lengthscale) == pytest.approx(math.log(0.3))
-    assert float(kernel.raw_shape) == pytest.approx(math.log(1.7))
-    assert float(kernel.precision) == pytest.approx(1.0 / 0.09)
+    assert number(kernel.raw_sd) == pytest.approx(math.log(0.02))
+    assert number(kernel.raw_lengthscale) == pytest.approx(math.log(0.3))
+    assert number(kernel.raw_shape) == pytest.approx(math.log(1.7))
+    assert number(kernel.precision) == pytest.approx(1.0 / 0.09)
     assert StationaryKernel("matern52").shape is None
 
 
 def test_a_plain_number_is_set_in_double_precision() -> None:
     kernel = StationaryKernel("rational_quadratic").double()
     kernel.sd, kernel.lengthscale, kernel.shape = 0.02, 0.3, 1.7
-    values = {name: float(getattr(kernel, name)) for name in ("sd", "lengthscale", "shape")}
+    values = {name: number(getattr(kernel, name)) for name in ("sd", "lengthscale", "shape")}
     assert values == pytest.approx({"sd": 0.02, "lengthscale": 0.3, "shape": 1.7}, rel=1e-14)
 
 
