@@ -109,6 +109,7 @@ def demo(
     Five perturbed repetitions of a figure of eight are drawn from the generative model; four train, the fifth tests.
     """
     console = Console()
+    check_replaceable(out / "model", METADATA)
     prepare_folder(out)
     recording = record(out, seed)
     console.print(

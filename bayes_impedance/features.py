@@ -200,17 +200,26 @@ def check_combination(config: Config, log: PreparedLog) -> None:
 
 
 def trial_key(trial: PreparedTrial) -> str:
-    """Identity of a trial's motion, whatever its file is called."""
-    digest = hashlib.sha256(trial.group.encode())
-    for array in (trial.time, trial.position):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
+    """Identity of a trial's motion and force, whatever its file is called."""
+    return _key(trial, trial.force)
 
 
 def label_trials(*logs: PreparedLog) -> dict[str, int]:
-    """One label for each distinct trial of the logs."""
-    keys = dict.fromkeys(trial_key(trial) for log in logs for trial in log.trials)
-    return {key: label for label, key in enumerate(keys)}
+    """One label for each distinct trial of the logs; one without force is the trial that has its motion."""
+    labels: dict[str, int] = {}
+    # Those with force come first, so that those without find them.
+    trials = sorted((trial for log in logs for trial in log.trials), key=lambda trial: trial.force is None)
+    for count, trial in enumerate(trials):
+        label = labels.setdefault(trial_key(trial), count)
+        labels.setdefault(_key(trial, None), label)
+    return labels
+
+
+def _key(trial: PreparedTrial, force: Array | None) -> str:
+    digest = hashlib.sha256(trial.group.encode())
+    for array in (trial.time, trial.position, force):
+        digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
 
 
 def _residual_input(model: ModelConfig) -> tuple[Component, ...]:

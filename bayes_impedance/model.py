@@ -12,7 +12,7 @@ import torch
 
 from bayes_impedance.config import Config, load_config
 from bayes_impedance.engines.dense import Observations, check_capacity, log_marginal_likelihood
-from bayes_impedance.engines.pointwise import PointPredictor, single_axis
+from bayes_impedance.engines.pointwise import PointPredictor
 from bayes_impedance.errors import ConfigurationError, LogError
 from bayes_impedance.features import FeatureMap, check_combination, label_trials, trial_key
 from bayes_impedance.identifiability import Verdict, assess
@@ -172,7 +172,7 @@ class ImpedanceModel:
         with torch.no_grad():
             given = observations(model, features)
             one = Observations(given.inputs[a, g, :n], given.residual[a, g, :n], given.noise_variance[a, 0])
-        return PointPredictor(single_axis(model.kernel, a), one, self.config.engine.jitter)
+        return PointPredictor(model.kernel[a, 0], one, self.config.engine.jitter)
 
     def log_marginal_likelihood(self, log: InteractionLog | PreparedLog) -> dict[str, float]:
         """log p(force of `log`) at the model's hyperparameters, by axis, summed over groups [nats].
@@ -194,7 +194,15 @@ class ImpedanceModel:
         return dict(zip(prepared.axes, value.tolist(), strict=True))
 
     def verdicts(self, posterior: Posterior | None = None) -> list[Verdict]:
-        """What the data say of stiffness, damping and mass; by default at the training samples."""
+        """What the data say of stiffness, damping and mass; by default at the training samples.
+
+        Raises:
+            ConfigurationError: levels are to be learned and the model is not fitted: its posterior would be
+                centred wherever the hyperprior happens to be.
+        """
+        impedance = (self.config.model.stiffness, self.config.model.damping, self.config.model.mass)
+        if not all(prior.level.fixed for prior in impedance):
+            _ = self.fitted
         return assess(self.posterior(self.fitted.log) if posterior is None else posterior, self.config)
 
     def force_model(self, axes: tuple[str, ...]) -> ForceModel:

@@ -213,16 +213,18 @@ class _Conditioner:
             variance = variance + ((loading @ self.level_covariance) * loading).sum(-1)
         if latent is Latent.FORCE:
             variance = variance + self.model.noise_variance
-        return location, variance, prior_location.expand_as(location), prior_variance.expand_as(location)
+        shown = _hyperprior_location(self.model, prior_location, latent)
+        return location, variance, shown.expand_as(location), prior_variance.expand_as(location)
 
 
 def _prior_only(model: ForceModel, target: Features, latents: Sequence[Latent]) -> dict[Latent, Moments]:
     result = {}
     for latent in latents:
         location, variance = _prior(model, target, latent)
+        shown = _hyperprior_location(model, location, latent)
         shape = target.inputs.shape[:-1]
         result[latent] = (
-            location.expand(shape), variance.expand(shape), location.expand(shape), variance.expand(shape),
+            location.expand(shape), variance.expand(shape), shown.expand(shape), variance.expand(shape),
         )  # fmt: skip
     return result
 
@@ -256,6 +258,15 @@ def _prior(model: ForceModel, target: Features, latent: Latent) -> tuple[Tensor,
     process = model.kernel.impedance.processes[IMPEDANCE_ORDER[latent]]
     level = process.level[..., 0]
     return (level if process.law == "gaussian" else level.log()), variance
+
+
+def _hyperprior_location(model: ForceModel, location: Tensor, latent: Latent) -> Tensor:
+    """Where the prior of a latent lay before training: for impedance at the median of its level's hyperprior."""
+    if latent not in IMPEDANCE_ORDER:
+        return location
+    median = next(entry.medians for entry in model.entries if entry.name == f"{latent.value}.level")
+    process = model.kernel.impedance.processes[IMPEDANCE_ORDER[latent]]
+    return median if process.law == "gaussian" else median.log()
 
 
 def _levels(model: ForceModel, inputs: Tensor) -> tuple[Tensor, Tensor] | None:

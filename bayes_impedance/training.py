@@ -105,26 +105,13 @@ def train(
         search.begin(restart, progress)
         clock = time.perf_counter()
         try:
-            result = minimize(  # type: ignore[call-overload] # the stubs know no bounds as a list of pairs with a callback
-                search,
-                start,
-                jac=True,
-                method="L-BFGS-B",
-                bounds=search.bounds,
-                callback=search.report,
-                options={
-                    "maxiter": config.max_iterations,
-                    "gtol": config.gradient_tolerance,
-                    "ftol": RELATIVE_TOLERANCE,
-                },
-            )
-            outcome = str(result.message)
+            outcome = _climb(search, start, config)
         except NotPositiveDefiniteError as error:
             failure, outcome = error, f"stopped: {error}"
         except KeyboardInterrupt:
             interrupted, outcome = True, "interrupted"
         reports.append(search.summary(restart, outcome, time.perf_counter() - clock))
-        if interrupted:
+        if interrupted or not start.size:
             break
     if not np.isfinite(search.best_objective).all():
         if failure is not None:
@@ -141,6 +128,27 @@ def train(
         interrupted=interrupted,
         samples=sum(len(rows) for rows in features.rows),
     )
+
+
+def _climb(search: _Search, start: Array, config: TrainingConfig) -> str:
+    """One run of L-BFGS from `start`; how it ended."""
+    if not start.size:
+        search(start)
+        return "every hyperparameter is fixed"
+    result = minimize(  # type: ignore[call-overload] # the stubs know no bounds as a list of pairs with a callback
+        search,
+        start,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=search.bounds,
+        callback=search.report,
+        options={
+            "maxiter": config.max_iterations,
+            "gtol": config.gradient_tolerance,
+            "ftol": RELATIVE_TOLERANCE,
+        },
+    )
+    return str(result.message)
 
 
 class _Search:

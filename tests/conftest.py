@@ -2,7 +2,8 @@
 
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,6 +34,24 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"real recordings are not at hand: no folder {folder}")
     return folder
+
+
+@pytest.fixture
+def full_disk() -> Callable[[], AbstractContextManager[None]]:
+    """Within `with full_disk():` no file grows beyond 4 kB; a limit of file size stands in for a full disk."""
+    resource = pytest.importorskip("resource", reason="limits of file size are for Unix")
+
+    @contextmanager
+    def limited() -> Iterator[None]:
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        # Python ignores the signal that comes with it.
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+    return limited
 
 
 @dataclass(frozen=True)
@@ -78,9 +97,7 @@ class Outcome:
 
 
 @pytest.fixture
-def command(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., Outcome]:
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
     """The command line in this process: `command("train", log, …)` gives code, stdout and stderr."""
     from bayes_impedance.cli import main
 
@@ -90,7 +107,7 @@ def command(
         code = 0
         with warnings.catch_warnings():
             # A command prints our warnings; elsewhere in the tests they are errors like any other.
-            warnings.simplefilter("always", LogWarning)
+            warnings.simplefilter("default", LogWarning)
             try:
                 main()
             except SystemExit as exit_:

@@ -2,12 +2,8 @@
 
 import errno
 import os
-import resource
 import shutil
-import signal
 import stat
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
@@ -122,7 +118,9 @@ def test_file_replaces_another(tmp_path):
 
 
 @pytest.mark.parametrize("existing", [None, "old"])
-@pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left on device"), ValueError, KeyboardInterrupt])
+@pytest.mark.parametrize(
+    "failure", [OSError(errno.ENOSPC, "No space left on device"), ValueError, KeyboardInterrupt]
+)
 def test_nothing_is_left_of_half_a_file(tmp_path, existing, failure):
     path = tmp_path / "new.csv"
     if existing is not None:
@@ -140,13 +138,19 @@ def test_nothing_is_left_of_half_a_file(tmp_path, existing, failure):
 def test_file_that_cannot_be_put_in_place(tmp_path, monkeypatch):
     path = tmp_path / "new.csv"
     monkeypatch.setattr(Path, "replace", no_space)
-    with pytest.raises(OutputError, match="could not be written: No space left"), whole_file(path) as temporary:
+    with (
+        pytest.raises(OutputError, match="could not be written: No space left"),
+        whole_file(path) as temporary,
+    ):
         temporary.write_text("whole")
     assert content(tmp_path) == {}
 
 
 def test_folder_in_place_of_a_file(tmp_path):
-    with pytest.raises(OutputError, match="expected a file name to write to, found a folder"), whole_file(tmp_path):
+    with (
+        pytest.raises(OutputError, match="expected a file name to write to, found a folder"),
+        whole_file(tmp_path),
+    ):
         pytest.fail("not to be written")
 
 
@@ -169,24 +173,11 @@ def test_link_to_a_file_stays_a_link(tmp_path):
     assert target.read_text() == "new"
 
 
-def test_real_disk_limit(tmp_path):
-    """A file-size limit stands in for a full disk."""
-    program = (
-        "import sys; from pathlib import Path\n"
-        "from bayes_impedance.outputs import whole_file\n"
-        "with whole_file(Path(sys.argv[1])) as temporary: temporary.write_bytes(b'0' * 100_000)\n"
-    )
-
-    def limit() -> None:
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
-
+def test_real_disk_limit(tmp_path, full_disk):
     path = tmp_path / "new.csv"
-    done = subprocess.run(
-        [sys.executable, "-B", "-c", program, str(path)], capture_output=True, text=True, preexec_fn=limit, check=False
-    )
-    assert done.returncode == 1
-    assert done.stderr.splitlines()[-1].endswith(f"OutputError: {path}: could not be written: File too large")
+    with pytest.raises(OutputError) as caught, full_disk(), whole_file(path) as temporary:
+        temporary.write_bytes(b"0" * 100_000)
+    assert sentence(caught, path) == f"{path}: could not be written: File too large"
     assert content(tmp_path) == {}
 
 
@@ -225,7 +216,9 @@ def test_folder_behind_a_link(tmp_path, old):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["elsewhere", "model"]
 
 
-@pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left on device"), ValueError, KeyboardInterrupt])
+@pytest.mark.parametrize(
+    "failure", [OSError(errno.ENOSPC, "No space left on device"), ValueError, KeyboardInterrupt]
+)
 def test_nothing_is_left_of_half_a_folder(tmp_path, old, failure):
     before = content(tmp_path)
     expected = OutputError if isinstance(failure, OSError) else failure
@@ -241,7 +234,9 @@ def test_nothing_is_left_of_half_a_folder(tmp_path, old, failure):
 
 @pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
 @pytest.mark.parametrize("call", [1, 2])
-def test_old_folder_survives_a_failure_while_the_new_one_is_put_in_place(tmp_path, old, monkeypatch, call, failure):
+def test_old_folder_survives_a_failure_while_the_new_one_is_put_in_place(
+    tmp_path, old, monkeypatch, call, failure
+):
     """First the old folder steps aside, then the new one takes its place: either may fail."""
     calls = 0
     rename = Path.rename
@@ -275,7 +270,10 @@ def test_what_is_not_of_the_same_kind_is_left_alone(tmp_path, old):
     sentence(caught, old)
     file = tmp_path / "file"
     file.write_text("mine")
-    with pytest.raises(OutputError, match="expected a new folder name, found a file"), whole_folder(file, MARKER):
+    with (
+        pytest.raises(OutputError, match="expected a new folder name, found a file"),
+        whole_folder(file, MARKER),
+    ):
         pytest.fail("not to be written")
     with pytest.raises(OutputError, match="found a folder with other content"), whole_folder(old, MARKER):
         pytest.fail("not to be written")

@@ -171,7 +171,7 @@ def test_prior_moments_with_learned_levels() -> None:
             marginal.prior_location[:, 1], oracle.location(samples, latent), rtol=1e-12, atol=1e-14
         )
         # Nothing was given.
-        np.testing.assert_array_equal(marginal.location, marginal.prior_location)
+        np.testing.assert_allclose(marginal.location, marginal.prior_location, rtol=1e-14)
         np.testing.assert_array_equal(marginal.scale, marginal.prior_scale)
 
 
@@ -181,7 +181,7 @@ def test_under_the_equilibrium_mean_impedance_keeps_its_prior(name: str) -> None
     posterior = ImpedanceModel(config).posterior(group_log(config, seed=3))
     for latent in IMPEDANCE:
         marginal = posterior[latent]
-        np.testing.assert_array_equal(marginal.location, marginal.prior_location)
+        np.testing.assert_allclose(marginal.location, marginal.prior_location, rtol=1e-14)
         np.testing.assert_allclose(marginal.scale, marginal.prior_scale, rtol=1e-14)
         np.testing.assert_allclose(marginal.contraction, 0.0, atol=1e-14)
     assert (posterior["desired_position"].contraction > 0.1).all()

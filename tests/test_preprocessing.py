@@ -187,7 +187,9 @@ def test_window_is_the_nearest_odd_number_of_samples(window, rate, order, length
 def test_a_window_too_short_for_the_order_grows_with_a_warning(order, length):
     values = np.random.default_rng(4).normal(size=50)
     log = make(np.arange(50) / 20, values)
-    message = rf"too short for order {order} at 20 Hz, so its window is {length / 20:.3g} s \({length} samples"
+    message = (
+        rf"too short for order {order} at 20 Hz, so its window is {length / 20:.3g} s \({length} samples"
+    )
     with pytest.warns(LogWarning, match=message):
         trial = only(log, smoother(0.1, order))
     np.testing.assert_allclose(trial.position[:, 0], slow(values, length, order, 1 / 20, 0), atol=1e-9)
@@ -506,9 +508,7 @@ def test_from_arrays_refuses():
         {"axes": ["x"], "trials": [{"name": "0"}]},
         {"axes": ["x"], "trials": ["0"]},
     ):
-        with pytest.raises(
-            LogError, match="expected axes and trials in the header, found another one"
-        ):
+        with pytest.raises(LogError, match="expected axes and trials in the header, found another one"):
             PreparedLog.from_arrays(header, log.arrays())
 
 

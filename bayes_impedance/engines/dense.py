@@ -100,7 +100,7 @@ class _LogMarginalLikelihood(torch.autograd.Function):
         cholesky = _cholesky(kernel, observations, jitter)
         masked = _masked(residual, valid)
         alpha = torch.cholesky_solve(masked.unsqueeze(-1), cholesky).squeeze(-1)
-        count = residual.shape[-1] if valid is None else valid.sum(-1)
+        count = residual.shape[-1] if valid is None else valid.sum(-1).to(residual)
         log_det = 2.0 * cholesky.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         ctx.kernel, ctx.observations = kernel, observations
         ctx.save_for_backward(cholesky, alpha)
@@ -121,7 +121,7 @@ class _LogMarginalLikelihood(torch.autograd.Function):
 
         parameters = [p for p in kernel.parameters() if p.requires_grad]
         gradients = [torch.zeros_like(p) for p in parameters]
-        for start, stop in _blocks(observations.inputs):
+        for start, stop in _blocks(observations.inputs) if parameters else ():
             block_weight = _masked_block(weight[..., start:stop, :stop], valid, start, stop)
             # Below the diagonal each entry stands for itself and for its mirror image.
             block_weight[..., :start].mul_(2.0)
@@ -145,7 +145,8 @@ def _cholesky(kernel: Kernel, observations: Observations, jitter: float) -> Tens
         block = _block(kernel, inputs, start, stop)
         covariance[..., start:stop, :stop] = _masked_block(block, valid, start, stop)
     diagonal = covariance.diagonal(dim1=-2, dim2=-1)
-    added = jitter * diagonal.mean(-1, keepdim=True) + observations.noise_variance
+    count = n if valid is None else valid.sum(-1, keepdim=True)
+    added = jitter * diagonal.sum(-1, keepdim=True) / count + observations.noise_variance
     diagonal.add_(added if valid is None else torch.where(valid, added, 1.0))
     cholesky, info = torch.linalg.cholesky_ex(covariance)
     if bool(info.any()):

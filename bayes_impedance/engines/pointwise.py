@@ -7,7 +7,6 @@ are one small matrix times a matrix kept from training.
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -222,17 +221,6 @@ def _columns(columns: Sequence[int]) -> Any:
     if list(columns) == list(range(first, first + count)):
         return slice(first, first + count)
     return np.array(columns)
-
-
-def single_axis(kernel: InteractionKernel, axis: int) -> InteractionKernel:
-    """The kernel of one axis out of a batch `(axes, 1)`, without batch dimensions."""
-    alone = copy.deepcopy(kernel)
-    for module in alone.modules():
-        for parameter in module.parameters(recurse=False):
-            parameter.data = parameter.data[axis, 0]
-        if isinstance(module, Kernel):
-            module.batch_shape = torch.Size()
-    return alone
 
 
 def _parts(kernel: Kernel | None) -> list[Kernel]:

@@ -53,6 +53,8 @@ def derivative_table(
     Entries are `(..., n1, n2)`, or `(..., n)` with `diag`, in [unit of k / sⁱ⁺ʲ]. The common factor is
     kept apart so that sums over i, j are formed before the one multiplication by it.
     """
+    if (path1.acceleration is None) != (path2.acceleration is None):
+        path1, path2 = _with_acceleration(path1), _with_acceleration(path2)
     forms = _forms_diagonal(kernel, path1, path2) if diag else _forms(kernel, path1, path2)
     variance = kernel.sd**2
     shape = kernel.shape
@@ -61,6 +63,10 @@ def derivative_table(
         shape = None if shape is None else shape[..., 0]
     common, ratios = kernel.profile.derivatives(forms.s, shape)
     return variance * common, combine(kernel.profile, forms, ratios, order)
+
+
+def _with_acceleration(path: Path) -> Path:
+    return path if path.acceleration is not None else path._replace(acceleration=torch.zeros_like(path.theta))
 
 
 def combine(profile: Profile, forms: Forms, ratios: tuple[Any, ...], order: int) -> Table:

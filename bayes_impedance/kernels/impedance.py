@@ -19,7 +19,7 @@ from gpytorch.means import Mean
 from torch import Tensor
 
 from bayes_impedance.kernels.derivative import Path, Table, derivative_table, multiply_add
-from bayes_impedance.kernels.stationary import StationaryKernel
+from bayes_impedance.kernels.stationary import BatchedKernel, StationaryKernel
 from bayes_impedance.kernels.warped import ImpedanceProcess, evaluate
 
 
@@ -122,7 +122,7 @@ def force_covariance(
     return total
 
 
-class ImpedanceKernel(Kernel):
+class ImpedanceKernel(BatchedKernel):
     """Covariance of Σ_j w_j e⁽ʲ⁾ over orders 0, 1, 2: the paper's impedance kernel (14) [N²].
 
     Args:
@@ -145,6 +145,11 @@ class ImpedanceKernel(Kernel):
         active_dims: tuple[int, ...] | None = None,
     ) -> None:
         super().__init__(active_dims=active_dims)
+        for part in (trajectory, stiffness, damping, mass):
+            if part is not None:
+                _check_takes_every_column(
+                    part, "name ξ by the active_dims of the covariance, θ by the layout"
+                )
         self.layout = layout
         self.trajectory = trajectory
         self.stiffness = stiffness
@@ -253,7 +258,7 @@ def PDKernel(  # noqa: N802 - named as the kernel it builds
     return ImpedanceKernel(layout, trajectory, stiffness, damping, mass=None, active_dims=active_dims)
 
 
-class InteractionKernel(Kernel):
+class InteractionKernel(BatchedKernel):
     """Impedance plus residual force: the paper's interaction kernel (15) without its noise [N²].
 
     σ_r² belongs to the likelihood, as gpytorch has it.
@@ -270,6 +275,7 @@ class InteractionKernel(Kernel):
         active_dims: tuple[int, ...] | None = None,
     ) -> None:
         super().__init__(active_dims=active_dims)
+        _check_takes_every_column(impedance, "give active_dims to the InteractionKernel")
         self.impedance = impedance
         self.residual = residual
 
@@ -323,6 +329,14 @@ class InteractionMean(Mean):
     def forward(self, x: Tensor) -> Tensor:
         """E[u] = Σ_j E[w_j] ē_j, `(..., n)` [N]."""
         return self.kernel.prior_mean(x)
+
+
+def _check_takes_every_column(kernel: Kernel, remedy: str) -> None:
+    if kernel.active_dims is not None:
+        raise ValueError(
+            f"expected a {type(kernel).__name__} over every column of the input, got active_dims "
+            f"{kernel.active_dims.tolist()}, which would go unheard here; {remedy}"
+        )
 
 
 def _transposed(columns: list[Tensor] | None) -> list[Tensor] | None:

@@ -6,9 +6,11 @@ shapes, batches and hyperparameters live in `StationaryKernel`.
 
 from __future__ import annotations
 
+import copy
 import math
 from abc import ABC, abstractmethod
-from typing import ClassVar, NamedTuple
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from gpytorch.constraints import Interval, Positive
@@ -146,7 +148,41 @@ def log_positive() -> Positive:
     return Positive(transform=torch.exp, inv_transform=torch.log)
 
 
-class StationaryKernel(Kernel):
+class BatchedKernel(Kernel):
+    """Base of our kernels: indexing and expanding the batch of a whole tree of kernels.
+
+    gpytorch's own versions index the buffer `active_dims` as though it were a hyperparameter, and leave the
+    batch shape of a kernel without hyperparameters of its own as it was.
+    """
+
+    def __getitem__(self, index: Any) -> Self:
+        """Kernel of some entries of the batch."""
+        if not self.batch_shape:
+            return self
+        index = index if isinstance(index, tuple) else (index,)
+        return self._with_batch(lambda batch: torch.empty(batch)[index].shape, lambda p, _: p[index])
+
+    def expand_batch(self, *sizes: Any) -> Self:
+        """Kernel whose batch is broadcast to `sizes`."""
+        shape = torch.Size(sizes[0] if len(sizes) == 1 and not isinstance(sizes[0], int) else sizes)
+        if shape == self.batch_shape:
+            return self
+        return self._with_batch(lambda _: shape, lambda p, batch: p.expand(*shape, *p.shape[len(batch) :]))
+
+    def _with_batch(
+        self, shape: Callable[[torch.Size], torch.Size], change: Callable[[Tensor, torch.Size], Tensor]
+    ) -> Self:
+        new = copy.deepcopy(self)
+        kernels = [module for module in new.modules() if isinstance(module, Kernel)]
+        # Before any change: the batch of a kernel is that of its parts, too.
+        for kernel, batch in [(kernel, kernel.batch_shape) for kernel in kernels]:
+            for parameter in kernel.parameters(recurse=False):
+                parameter.data = change(parameter.data, batch)
+            kernel._batch_shape = shape(batch)
+        return new
+
+
+class StationaryKernel(BatchedKernel):
     """σ² κ(s) over the `active_dims` of the input; with no dimensions it is the constant σ².
 
     `sd` σ has shape `(*batch, 1, 1)` [unit of the process]; `lengthscale` ℓ has `(*batch, 1, p)` [unit of
@@ -211,6 +247,10 @@ class StationaryKernel(Kernel):
     def shape(self, value: Tensor | float) -> None:
         set_positive(self, "shape", value)
 
+    def _set_lengthscale(self, value: Tensor | float) -> None:
+        # As gpytorch does it, but not by way of single precision.
+        super()._set_lengthscale(torch.as_tensor(value, dtype=self.raw_lengthscale.dtype))
+
     @property
     def precision(self) -> Tensor:
         """Diagonal of P = 1/ℓ², `(*batch, 1, p)` or `(*batch, 1, 1)`."""
@@ -270,7 +310,8 @@ def set_positive(module: Kernel, name: str, value: Tensor | float) -> None:
     """Set hyperparameter `name` to `value` in its natural unit."""
     raw = getattr(module, f"raw_{name}")
     constraint = getattr(module, f"raw_{name}_constraint")
-    value = torch.as_tensor(value).to(raw).expand_as(raw)
+    # Through the dtype of the module: a Python number must not pass through single precision.
+    value = torch.as_tensor(value, dtype=raw.dtype, device=raw.device).expand_as(raw)
     module.initialize(**{f"raw_{name}": constraint.inverse_transform(value)})
 
 

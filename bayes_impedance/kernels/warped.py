@@ -15,12 +15,12 @@ from gpytorch.priors import Prior
 from linear_operator import to_dense
 from torch import Tensor
 
-from bayes_impedance.kernels.stationary import register_positive, set_positive
+from bayes_impedance.kernels.stationary import BatchedKernel, register_positive, set_positive
 
 Law = Literal["gaussian", "log_gaussian"]
 
 
-class ImpedanceProcess(Kernel):
+class ImpedanceProcess(BatchedKernel):
     """One of k, d, m as a process over ξ; as a gpytorch kernel it is Cov[w(ξ), w(ξ')].
 
     Args:

@@ -6,7 +6,7 @@ import torch
 
 from bayes_impedance.config import parse_config
 from bayes_impedance.engines.dense import Observations
-from bayes_impedance.engines.pointwise import PointPredictor, single_axis
+from bayes_impedance.engines.pointwise import PointPredictor
 from bayes_impedance.errors import ConfigurationError
 from bayes_impedance.features import FeatureMap
 from bayes_impedance.kernels import (
@@ -76,13 +76,3 @@ def test_other_covariances_are_refused():
     x = torch.linspace(0, 1, 5, dtype=torch.float64).unsqueeze(-1).repeat(1, 2)
     with pytest.raises(TypeError, match="expected covariances of class StationaryKernel, got ConstantKernel"):
         PointPredictor(kernel, Observations(x, x[:, 0], torch.ones(1, dtype=torch.float64)))
-
-
-def test_single_axis_takes_its_own_hyperparameters():
-    config = configuration("time", "squared_exponential")
-    model = ImpedanceModel(config).force_model(("x", "y"))
-    with torch.no_grad():
-        model.kernel.impedance.trajectory.raw_sd[1] = 2.0
-    alone = single_axis(model.kernel, 1)
-    assert alone.batch_shape == torch.Size()
-    assert float(alone.impedance.trajectory.raw_sd.detach()) == 2.0
