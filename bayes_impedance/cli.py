@@ -20,10 +20,11 @@ from bayes_impedance.demo import prepare_folder, record, truth_errors
 from bayes_impedance.errors import BayesImpedanceError, LogWarning, OutputError
 from bayes_impedance.evaluation import as_json, evaluate
 from bayes_impedance.identifiability import summarise
+from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.outputs import check_replaceable, check_writable, whole_file
 from bayes_impedance.persistence import METADATA, load_model, save_model
-from bayes_impedance.plotting import save_figures
+from bayes_impedance.plotting import plot_force, save_figure, save_figures
 from bayes_impedance.posterior import Posterior
 from bayes_impedance.readers import read_log
 
@@ -124,13 +125,14 @@ def demo(
     errors = truth_errors(lambda name: posterior[name].mean, model.fitted.log)
     listed = ", ".join(f"{name} {error:.1%}" for name, error in errors.items())
     console.print(f"Mean relative error against the truth: {listed}", highlight=False)
+    unseen = model.prepare(read_log(recording.testing, recording.config.log))
     with terminal.training_progress(console, recording.config.training, "naive GP") as progress:
-        scores = evaluate(
-            model, read_log(recording.testing, recording.config.log), naive=True, progress=progress
-        )
+        scores = evaluate(model, unseen, naive=True, progress=progress)
     console.print(terminal.evaluation_table(scores))
     _write_posterior(posterior, out / "posterior.csv")
-    figures = save_figures(posterior, verdicts, out)
+    figures = [*save_figures(posterior, verdicts, out), out / "predicted_force.png"]
+    predicted = model.posterior(unseen, given="training", latents=[Latent.FORCE])
+    save_figure(plot_force(predicted, title="Force of an unseen repetition, predicted"), figures[-1])
     for path in (out / "model", out / "posterior.csv", *figures):
         console.print(f"wrote {path}")
 

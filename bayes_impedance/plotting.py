@@ -26,7 +26,9 @@ Share = Literal["all", "row", "col"]
 POSTERIOR, PRIOR, MEASURED, TRUTH = "#0b6e99", "#9aa5ab", "#1a1a1a", "#c2410c"
 
 
-def plot_force(posterior: Posterior, trials: Sequence[int] | None = None) -> Figure:
+def plot_force(
+    posterior: Posterior, trials: Sequence[int] | None = None, title: str = "Interaction force"
+) -> Figure:
     """Measured force and the posterior of a new measurement with its 90 % band, an axis a row, a trial a column."""
     chosen = _chosen(posterior, trials)
     figure, grid = _grid(len(posterior.axes), len(chosen), sharex="col", sharey="row")
@@ -40,7 +42,7 @@ def plot_force(posterior: Posterior, trials: Sequence[int] | None = None) -> Fig
                 ax.plot(trial.time, trial.force[:, a], ".", ms=2.5, color=MEASURED, label="measured")
             _label(ax, column, a, len(posterior.axes), f"force {axis} [N]", "time [s]")
         grid[0][column].set_title(f"trial {trial.name}", fontsize=9)
-    return _finished(figure, grid, "Interaction force")
+    return _finished(figure, grid, title)
 
 
 def plot_desired_trajectory(posterior: Posterior, trials: Sequence[int] | None = None) -> Figure:
@@ -64,7 +66,7 @@ def plot_desired_trajectory(posterior: Posterior, trials: Sequence[int] | None =
 
 def plot_impedance(posterior: Posterior, verdicts: Iterable[Verdict], trial: int = 0) -> Figure:
     """Stiffness, damping and mass along one trial: prior and posterior 90 % bands, with the verdict."""
-    figure, grid = _grid(len(IMPEDANCE_ORDER), len(posterior.axes), sharex="all", sharey="row", height=2.2)
+    figure, grid = _grid(len(IMPEDANCE_ORDER), len(posterior.axes), sharex="all", sharey="row", width=4.6)
     said = {(verdict.latent, verdict.axis): verdict for verdict in verdicts}
     record, rows = posterior.log.trials[trial], posterior.trial_slice(trial)
     by_phase = record.phase is not None
@@ -105,12 +107,19 @@ def save_figures(
         "desired_trajectory.png": plot_desired_trajectory(posterior, trials),
         "impedance.png": plot_impedance(posterior, verdicts, _chosen(posterior, trials)[0]),
     }
-    paths = []
     for name, figure in figures.items():
-        with whole_file(folder / name) as temporary:
-            figure.savefig(temporary, dpi=130)
-        paths.append(folder / name)
-    return paths
+        save_figure(figure, folder / name)
+    return [folder / name for name in figures]
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write one figure as PNG.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=130)
 
 
 def _chosen(posterior: Posterior, trials: Sequence[int] | None) -> list[int]:
@@ -119,9 +128,9 @@ def _chosen(posterior: Posterior, trials: Sequence[int] | None) -> list[int]:
 
 
 def _grid(
-    rows: int, columns: int, sharex: Share, sharey: Share, height: float = 2.4
+    rows: int, columns: int, sharex: Share, sharey: Share, width: float = 3.2, height: float = 2.4
 ) -> tuple[Figure, list[list[Axes]]]:
-    figure = Figure(figsize=(max(6.0, 3.2 * columns), 0.7 + height * rows), layout="constrained")
+    figure = Figure(figsize=(max(6.0, width * columns), 0.7 + height * rows), layout="constrained")
     grid = figure.subplots(rows, columns, sharex=sharex, sharey=sharey, squeeze=False)
     return figure, [list(row) for row in grid]
 

@@ -1,5 +1,6 @@
 """Fixtures for every test."""
 
+import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -101,6 +102,10 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
     """The command line in this process: `command("train", log, …)` gives code, stdout and stderr."""
     from bayes_impedance.cli import main
 
+    # Colours and a terminal that pytest may run in are none of our business.
+    for name in ("FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
+        monkeypatch.delenv(name, raising=False)
+
     def run(*arguments: object) -> Outcome:
         monkeypatch.setattr(sys, "argv", ["bayes-impedance", *map(str, arguments)])
         capsys.readouterr()
@@ -113,6 +118,7 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
             except SystemExit as exit_:
                 code = int(exit_.code or 0)
         captured = capsys.readouterr()
-        return Outcome(code, captured.out, captured.err)
+        out, err = (re.sub(r"\x1b\[[0-9;]*m", "", text) for text in captured)
+        return Outcome(code, out, err)
 
     return run

@@ -1,8 +1,7 @@
 """Configuration: what ships, what is refused and in which words, and that nothing else ever escapes."""
 
-import math
 import re
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 import yaml
@@ -495,16 +494,21 @@ def sections(section: type[Section] = Config) -> st.SearchStrategy:
     return st.fixed_dictionaries({}, optional=inner)
 
 
+def problem(read: Callable[[], Config]) -> str | None:
+    """The sentence of the refusal; None where the configuration is read, and comes back from its own dump."""
+    try:
+        config = read()
+    except ConfigurationError as error:
+        return str(error)
+    assert parse_config(yaml.safe_load(dump_config(config))) == config
+    return None
+
+
 @settings(max_examples=150, deadline=None)
 @given(st.one_of(yamlish, sections()))
 def test_any_content_is_a_configuration_or_refused(content):
-    try:
-        config = parse_config(content)
-    except ConfigurationError as error:
-        assert str(error).startswith("configuration: ")
-        assert "\n" not in str(error)
-    else:
-        assert parse_config(yaml.safe_load(dump_config(config))) == config
+    said = problem(lambda: parse_config(content, "here"))
+    assert said is None or re.fullmatch("here: .+", said)
 
 
 @settings(max_examples=150, deadline=None)
@@ -516,19 +520,14 @@ def test_any_content_is_a_configuration_or_refused(content):
     )
 )
 def test_any_override_is_applied_or_refused(override):
-    try:
-        parse_config({}, overrides=[override])
-    except ConfigurationError as error:
-        assert str(error).startswith("--set")
+    said = problem(lambda: parse_config({}, overrides=[override]))
+    assert said is None or said.startswith("--set")
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.one_of(st.binary(max_size=40), yamlish.map(lambda v: yaml.dump(v).encode("utf-8", "replace"))))
 def test_any_file_is_a_configuration_or_refused(tmp_path_factory, content):
-    path = Path(tmp_path_factory.getbasetemp()) / "any.yaml"
+    path = tmp_path_factory.getbasetemp() / "any.yaml"
     path.write_bytes(content)
-    try:
-        load_config(path)
-    except ConfigurationError as error:
-        assert str(error).startswith(str(path))
-        assert math.isfinite(len(str(error)))
+    said = problem(lambda: load_config(path))
+    assert said is None or said.startswith(f"{path}: ")

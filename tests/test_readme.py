@@ -1,0 +1,97 @@
+"""The README's code, commands, configurations and figures are true."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from bayes_impedance.config import parse_config, shipped_configurations
+from bayes_impedance.demo import TRUTH, write_log
+from bayes_impedance.simulation.generative import as_recording, draw_force, repeated_motion
+
+ROOT = Path(__file__).resolve().parent.parent
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, flags=re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder like the one that `make demo` leaves, with a smaller experiment in it."""
+    folder = tmp_path_factory.mktemp("readme")
+    (folder / "demo").mkdir()
+    motion = repeated_motion(repetitions=3, duration=2.0, rate=50.0, axes=("x",), displacement_sd=0.012)
+    log = as_recording(draw_force(parse_config(TRUTH), motion, seed=0))
+    write_log(log.select([0, 1]), folder / "demo" / "training.csv")
+    write_log(log.select([2]), folder / "demo" / "testing.csv")
+    return folder
+
+
+def test_python_example_runs_and_prints_a_verdict(place: Path) -> None:
+    (code,) = blocks("python")
+    assert len([line for line in code.splitlines() if line]) == 5
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=place, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stderr
+    assert "stiffness xx:" in result.stdout
+
+
+def test_commands_run_in_the_order_shown(place: Path) -> None:
+    commands = [
+        line for block in blocks("sh") for line in block.splitlines() if line.startswith("bayes-impedance")
+    ]
+    assert [command.split()[1] for command in commands] == ["train", "infer", "evaluate", "show"]
+    for command in commands:
+        arguments = [sys.executable, "-m", "bayes_impedance", *shlex.split(command)[1:]]
+        result = subprocess.run(arguments, cwd=place, capture_output=True, text=True, check=False)
+        assert result.returncode == 0, result.stderr
+    assert (place / "figures" / "impedance.png").is_file()
+    assert json.loads((place / "scores.json").read_text())["axes"]["x"]["naive"]["n"] > 0
+
+
+def test_configuration_is_valid() -> None:
+    for block in blocks("yaml"):
+        parse_config(yaml.safe_load(block))
+
+
+def test_every_shipped_configuration_is_listed() -> None:
+    for name in shipped_configurations():
+        assert f"`{name}`" in README
+
+
+def test_make_targets_and_links_exist() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for target in re.findall(r"make ([a-z]+)", README):
+        assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE), target
+    for link in re.findall(r"\]\(([^)#]+)\)", README):
+        assert (ROOT / link).is_file(), link
+
+
+def test_quoted_figures_are_those_of_the_results() -> None:
+    figures = json.loads((ROOT / "results" / "core.json").read_text(encoding="utf-8"))["figures"]
+    table = README.split("<!-- figures:")[1].split("<!-- end of figures -->")[0]
+    iiwa, scores = figures["known_equilibrium"], figures["demo"]["scores"]["axes"]
+    stiffness, late = iiwa["stiffness"], iiwa["reference_one_second_late"]
+    quoted = [
+        f"{stiffness['mean']:.1f} N/m, 90 % interval {stiffness['q05']:.1f}–{stiffness['q95']:.1f}",
+        f"{iiwa['least_squares_stiffness']:.1f} N/m, least-squares",
+        f"{late['log_likelihood']:.1f}, {late['residual_rms']:.2f} N rms",
+        f"{iiwa['log_likelihood']:.1f}, {iiwa['residual_rms']:.2f} N rms",
+        ", ".join(f"{scores[axis]['impedance']['msll']:.2f}" for axis in "xy"),
+        ", ".join(f"{scores[axis]['naive']['msll']:.2f}" for axis in "xy"),
+        *(
+            ", ".join(f"{figures['coverage'][theta][latent]:.0%}" for theta in ("time", "phase", "position"))
+            for latent in ("force", "desired_position")
+        ),
+    ]
+    plain = table.replace("−", "-").replace(" %", "%")
+    for figure in quoted:
+        assert figure.replace(" %", "%") in plain, figure
