@@ -30,12 +30,13 @@ def evaluate(
     """Score the force of `log` predicted from the training forces alone; optionally train a naive GP beside.
 
     Raises:
-        LogError: the log has no force.
+        LogError: the log has no force, or the same force throughout.
     """
     prepared = model.prepare(log)
     if any(trial.force is None for trial in prepared.trials):
         raise LogError("expected a log with force to score against, found none; name log.columns.force")
     training = model.fitted.log
+    _check_variation(prepared)
     seen = {trial_key(trial) for trial in training.trials}
     if any(trial_key(trial) in seen for trial in prepared.trials):
         warnings.warn(
@@ -64,6 +65,17 @@ def as_json(evaluation: Evaluation) -> dict[str, object]:
             for axis, models in evaluation.items()
         }
     }
+
+
+def _check_variation(log: PreparedLog) -> None:
+    for a, axis in enumerate(log.axes):
+        force = np.concatenate([trial.force[:, a] for trial in log.trials if trial.force is not None])
+        # A constant that went through the smoother carries rounding errors.
+        if np.ptp(force) <= 1e-9 * np.abs(force).max():
+            raise LogError(
+                f"expected force that varies along axis {axis} to score against, found {force[0]:.4g} N throughout; "
+                f"drop {axis} from log.axes, or give a log with contact"
+            )
 
 
 def _scores(posterior: Posterior, training: PreparedLog, axis: int) -> Scores:
