@@ -57,10 +57,14 @@ app = typer.Typer(
     ),
 )
 
-Model = Annotated[Path, typer.Argument(help="Folder that train wrote.", show_default=False)]
+Model = Annotated[Path, typer.Argument(metavar="MODEL", help="Folder that train wrote.", show_default=False)]
 Logs = Annotated[
     list[Path],
-    typer.Argument(help="Recordings: .csv, .tsv, .txt or .parquet; several may follow.", show_default=False),
+    typer.Argument(
+        metavar="LOG",
+        help="Recordings: .csv, .tsv, .txt or .parquet; several may follow.",
+        show_default=False,
+    ),
 ]
 
 

@@ -403,7 +403,7 @@ def _validate(content: Mapping[str, Any], where: str) -> Config:
     try:
         return Config.model_validate(content)
     except ValidationError as error:
-        raise ConfigurationError(f"{where}: {_explain(error)}") from error
+        raise ConfigurationError(f"{where}: {' '.join(_explain(error).split())}") from error
 
 
 def dump_config(config: Config) -> str:

@@ -189,7 +189,9 @@ def check_combination(config: Config, log: PreparedLog) -> None:
     model = config.model
     if model.trajectory_input == "phase" and model.desired_trajectory.mean == "equilibrium":
         for group in log.groups:
-            count = sum(np.unique(trial.repetition).size for trial in log.trials if trial.group == group)
+            count = count_repetitions(
+                log.select([i for i, trial in enumerate(log.trials) if trial.group == group])
+            )
             if count > 1:
                 raise ConfigurationError(
                     "desired_trajectory.mean: expected trial_average, reference or constant with "
@@ -197,6 +199,15 @@ def check_combination(config: Config, log: PreparedLog) -> None:
                     f"'{group}'; the hand is not a function of phase there, so equilibrium would make "
                     "x_d − x the shared function; set model.desired_trajectory.mean=trial_average"
                 )
+
+
+def count_repetitions(log: PreparedLog, others: Sequence[PreparedTrial] = ()) -> int:
+    """Repetitions of the group of `log` that has fewest, `others` counted in, each motion once."""
+    distinct = {trial_key(trial): trial for trial in (*log.trials, *others)}.values()
+    return min(
+        sum(np.unique(trial.repetition).size for trial in distinct if trial.group == group)
+        for group in log.groups
+    )
 
 
 def trial_key(trial: PreparedTrial) -> str:

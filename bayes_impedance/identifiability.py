@@ -45,8 +45,13 @@ class Verdict:
         return UNITS[self.latent]
 
 
-def assess(posterior: Posterior, config: Config) -> list[Verdict]:
-    """Verdicts on stiffness, damping and mass of each axis, averaged over the samples of `posterior`."""
+def assess(posterior: Posterior, config: Config, repetitions: int) -> list[Verdict]:
+    """Verdicts on stiffness, damping and mass of each axis, averaged over the samples of `posterior`.
+
+    `repetitions` of one task in the forces given, of the group that has fewest. However much a posterior
+    contracts, nothing is claimed where the design of the experiment cannot tell impedance from intention.
+    """
+    confounded = confounding(config, repetitions)
     verdicts = []
     for latent in IMPEDANCE_ORDER:
         marginal = posterior[latent]
@@ -54,7 +59,7 @@ def assess(posterior: Posterior, config: Config) -> list[Verdict]:
         prior_low, prior_high = marginal.prior_quantile(0.05), marginal.prior_quantile(0.95)
         for a, axis in enumerate(posterior.axes):
             contraction = float(marginal.contraction[a])
-            support = classify(contraction)
+            support = classify(contraction) if confounded is None else Support.PRIOR_ONLY
             verdicts.append(
                 Verdict(
                     latent,
@@ -66,7 +71,7 @@ def assess(posterior: Posterior, config: Config) -> list[Verdict]:
                     float(prior_high[:, a].mean()),
                     contraction,
                     support,
-                    _sentence(latent, axis, contraction, support, config, posterior),
+                    _sentence(latent, axis, contraction, support, confounded, posterior),
                 )
             )
     return verdicts
@@ -79,8 +84,36 @@ def classify(contraction: float) -> Support:
     return Support.WEAK if contraction >= WEAK else Support.PRIOR_ONLY
 
 
+def confounding(config: Config, repetitions: int) -> str | None:
+    """Why this design cannot tell impedance from the desired trajectory; None where it can (DESIGN §7).
+
+    It can where the desired trajectory is known (`reference`), or where several repetitions, displaced in
+    different ways, share one as a function of phase or time. A function of position takes the value x + u/k for any
+    k, and so does a desired trajectory that was seen once.
+    """
+    model = config.model
+    mean, theta = model.desired_trajectory.mean, model.trajectory_input
+    if mean == "reference":
+        return None
+    if mean == "equilibrium":
+        return "with the equilibrium mean the force tells only the product of impedance and the SD of x_d"
+    if theta in ("position", "position_velocity"):
+        return f"a desired trajectory that is a function of {theta.replace('_', ' and ')} fits any stiffness"
+    shared = config.shared.desired_trajectory
+    if not (theta != "time" if shared is None else shared) or repetitions < 2:
+        return (
+            "each desired trajectory was seen once, and x_d = x + u/k fits any stiffness: repeat the motion"
+        )
+    return None
+
+
 def _sentence(
-    latent: Latent, axis: str, contraction: float, support: Support, config: Config, posterior: Posterior
+    latent: Latent,
+    axis: str,
+    contraction: float,
+    support: Support,
+    confounded: str | None,
+    posterior: Posterior,
 ) -> str:
     name = f"{latent.value} {axis}{axis}"
     if np.isclose(posterior[latent].prior_scale[:, posterior.axes.index(axis)], 0.0).all():
@@ -88,10 +121,9 @@ def _sentence(
     share = f"the data removed {_percentage(contraction)} of the prior variance"
     if support is not Support.PRIOR_ONLY:
         return f"{name}: {support.value}; {share}."
-    if config.model.desired_trajectory.mean == "equilibrium":
-        reason = "with the equilibrium mean the force tells only the product of impedance and the SD of x_d"
-    else:
-        reason = "perturb the motion, repeat it, or give a reference"
+    reason = confounded or "perturb the motion, repeat it, or give a reference"
+    if contraction >= WEAK:
+        share = f"the contraction of {rounded(contraction)} rests on the assumed desired trajectory, not on the data"
     return f"{name}: prior only; {share}: {reason}."
 
 

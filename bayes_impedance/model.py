@@ -14,7 +14,7 @@ from bayes_impedance.config import Config, load_config
 from bayes_impedance.engines.dense import Observations, check_capacity, log_marginal_likelihood
 from bayes_impedance.engines.pointwise import PointPredictor
 from bayes_impedance.errors import ConfigurationError, LogError
-from bayes_impedance.features import FeatureMap, check_combination, label_trials, trial_key
+from bayes_impedance.features import FeatureMap, check_combination, count_repetitions, label_trials, trial_key
 from bayes_impedance.identifiability import Verdict, assess
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.log import InteractionLog
@@ -203,7 +203,10 @@ class ImpedanceModel:
         impedance = (self.config.model.stiffness, self.config.model.damping, self.config.model.mass)
         if not all(prior.level.fixed for prior in impedance):
             _ = self.fitted
-        return assess(self.posterior(self.fitted.log) if posterior is None else posterior, self.config)
+        if posterior is None:
+            posterior = self.posterior(self.fitted.log)
+        known = () if self._fit is None else self._fit.log.trials
+        return assess(posterior, self.config, count_repetitions(posterior.log, known))
 
     def force_model(self, axes: tuple[str, ...]) -> ForceModel:
         """The gpytorch kernel, mean and likelihood underneath, to take into one's own code."""

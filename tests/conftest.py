@@ -28,7 +28,7 @@ TINY = (
 )
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Folder of the real recordings; skips where they are absent."""
     folder = Path(__file__).resolve().parents[2] / "shared" / "data"

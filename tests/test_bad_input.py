@@ -337,7 +337,10 @@ CASES: dict[str, tuple[Callable[[Bench], Arguments], tuple[str, ...]]] = {
     ),
     "phase that rests": (
         changed(phase=put(0.2, 30, 31)),
-        (r"bad\.csv, trial '0', column phase: expected phase to increase strictly", r"found 0\.2 .*; label", "cut pauses"),
+        (
+            r"bad\.csv, trial '0', column phase: expected phase to increase strictly within a repetition",
+            r"found 0\.2 .*; label repetitions .*, and cut pauses",
+        ),
     ),
     # --- axes and columns that the model needs
     "axes that differ between files": (

@@ -247,6 +247,7 @@ def test_demo_does_the_main_job_and_meets_the_truth(command, tmp_path, monkeypat
         "impedance.png",
         "model",
         "posterior.csv",
+        "predicted_force.png",
         "testing.csv",
         "training.csv",
     ]
@@ -328,7 +329,7 @@ def test_version(command):
         (("train", "log.csv", "--config", "time", "--out", "m", "--fast"), "No such option"),
         (("infer", "model", "log.csv", "--out", "p.csv", "--given", "nothing"), "is not one of"),
         (("evaluate", "model", "log.csv", "--baseline", "ensemble"), "is not|Choose from"),
-        (("demo", "--seed", "-1"), "-1 is not"),
+        (("demo", "--seed", "-1"), "Invalid value for '--seed'"),
     ],
 )
 def test_wrong_usage(command, arguments, mention):

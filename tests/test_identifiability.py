@@ -9,7 +9,18 @@ import pytest
 from oracles import MODEL, configuration
 
 from bayes_impedance.config import Config
-from bayes_impedance.identifiability import Support, Verdict, assess, caveat, classify, rounded, summarise
+from bayes_impedance.errors import ConfigurationError
+from bayes_impedance.features import count_repetitions
+from bayes_impedance.identifiability import (
+    Support,
+    Verdict,
+    assess,
+    caveat,
+    classify,
+    confounding,
+    rounded,
+    summarise,
+)
 from bayes_impedance.kernels import Latent
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.posterior import Marginal, Posterior
@@ -39,7 +50,7 @@ def posterior_with(contraction: float, prior_scale: float = 0.5, perturbation: b
 
 
 def stiffness_of(posterior: Posterior, config: Config) -> Verdict:
-    return next(verdict for verdict in assess(posterior, config) if verdict.latent is Latent.STIFFNESS)
+    return next(verdict for verdict in assess(posterior, config, 2) if verdict.latent is Latent.STIFFNESS)
 
 
 @pytest.mark.parametrize(
@@ -92,7 +103,7 @@ def test_claims_without_perturbation_column_come_with_a_caveat(contraction: floa
     config = configuration(desired_trajectory=TRIAL_AVERAGE)
 
     def caveat_of(posterior: Posterior, config: Config) -> str | None:
-        return caveat(assess(posterior, config), posterior, config)
+        return caveat(assess(posterior, config, 2), posterior, config)
 
     said = caveat_of(posterior_with(contraction), config)
     assert said is not None
@@ -139,7 +150,7 @@ def test_numbers_are_averages_over_the_path() -> None:
         Latent.STIFFNESS: replace(posterior[Latent.STIFFNESS], location=location),
     }
     posterior = replace(posterior, marginals=marginals)
-    verdicts = assess(posterior, configuration())
+    verdicts = assess(posterior, configuration(), repetitions=2)
     assert [(v.latent, v.axis) for v in verdicts] == [
         (latent, axis) for latent in (Latent.STIFFNESS, Latent.DAMPING, Latent.MASS) for axis in "xy"
     ]
@@ -155,7 +166,7 @@ def test_numbers_are_averages_over_the_path() -> None:
 
 
 def test_summary_for_json() -> None:
-    summary = summarise(assess(posterior_with(0.9), configuration()))
+    summary = summarise(assess(posterior_with(0.9), configuration(), repetitions=2))
     assert list(summary) == [f"{q}_{a}{a}" for q in ("stiffness", "damping", "mass") for a in "xy"]
     assert set(summary["stiffness_xx"]) == {"mean", "q05", "q95", "contraction", "verdict"}
     assert summary["mass_yy"]["verdict"] == "supported by these data"
@@ -183,3 +194,63 @@ def test_a_known_reference_supports_and_equilibrium_does_not() -> None:
     for verdict in ImpedanceModel(config).fit(log).verdicts():
         assert verdict.contraction == pytest.approx(0.0, abs=1e-12)
         assert verdict.support is Support.PRIOR_ONLY
+
+
+CONSTANT = {**MODEL["desired_trajectory"], "mean": "constant"}
+
+
+@pytest.mark.parametrize(
+    ("theta", "trajectory", "repetitions", "reason"),
+    [
+        ("time", MODEL["desired_trajectory"], 1, None),
+        ("phase", TRIAL_AVERAGE, 2, None),
+        ("phase", TRIAL_AVERAGE, 1, "seen once"),
+        ("phase", CONSTANT, 4, None),
+        ("time", CONSTANT, 4, "seen once"),
+        ("position", CONSTANT, 4, "function of position fits any stiffness"),
+        ("position_velocity", CONSTANT, 4, "function of position and velocity fits any stiffness"),
+        ("position", EQUILIBRIUM, 4, "only the product"),
+    ],
+)
+def test_designs_that_cannot_tell_impedance_from_intention(
+    theta: str, trajectory: dict[str, object], repetitions: int, reason: str | None
+) -> None:
+    config = configuration(trajectory_input=theta, desired_trajectory=trajectory)
+    found = confounding(config, repetitions)
+    assert (found is None) if reason is None else (found is not None and reason in found)
+
+
+def test_contraction_without_identification_claims_nothing() -> None:
+    config = configuration(trajectory_input="time", desired_trajectory=CONSTANT)
+    (verdict, *_) = assess(posterior_with(0.94), config, repetitions=1)
+    assert verdict.support is Support.PRIOR_ONLY
+    assert verdict.sentence == (
+        "stiffness xx: prior only; the contraction of 0.94 rests on the assumed desired trajectory, not on the "
+        "data: each desired trajectory was seen once, and x_d = x + u/k fits any stiffness: repeat the motion."
+    )
+
+
+def test_one_recording_around_a_constant_is_prior_only_though_it_contracts() -> None:
+    truth = configuration(trajectory_input="phase")
+    log = draw_force(truth, repeated_motion(repetitions=1, duration=2.0, rate=20.0), seed=0)
+    config = configuration(trajectory_input="time", desired_trajectory=CONSTANT)
+    verdicts = ImpedanceModel(config).verdicts(ImpedanceModel(config).posterior(log))
+    assert {verdict.support for verdict in verdicts} == {Support.PRIOR_ONLY}
+    assert max(verdict.contraction for verdict in verdicts) > 0.5
+
+
+def test_unfitted_levels_get_no_verdict() -> None:
+    config = configuration(stiffness={**MODEL["stiffness"], "level": {"median": 150, "log_sd": 1.0}})
+    log = draw_force(config, repeated_motion(repetitions=1, duration=1.0, rate=20.0), seed=0)
+    model = ImpedanceModel(config)
+    with pytest.raises(ConfigurationError, match="expected a fitted model"):
+        model.verdicts(model.posterior(log))
+
+
+def test_repetitions_count_each_motion_once_in_the_group_with_fewest() -> None:
+    two = repeated_motion(repetitions=2, duration=1.0, rate=20.0, seed=0)
+    three = repeated_motion(repetitions=3, duration=1.0, rate=20.0, seed=1, group="1")
+    both = PreparedLog(two.axes, two.trials + three.trials)
+    assert count_repetitions(both) == 2
+    assert count_repetitions(two, two.trials) == 2
+    assert count_repetitions(two, repeated_motion(1, 1.0, 20.0, seed=5).trials) == 3

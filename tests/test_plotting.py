@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from bayes_impedance.config import load_config
 from bayes_impedance.errors import OutputError
-from bayes_impedance.identifiability import rounded
+from bayes_impedance.identifiability import assess, rounded
 from bayes_impedance.log import InteractionLog
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.plotting import plot_desired_trajectory, plot_force, plot_impedance, save_figures
@@ -109,7 +109,9 @@ def test_impedance_never_without_its_verdict(posterior, verdicts):
             found = lines(ax)
             assert set(found) == {"posterior, 90 % band", "truth"}
             np.testing.assert_array_equal(found["truth"], [trial.phase, trial.truth[f"{name}_{axis}{axis}"]])
-            np.testing.assert_array_equal(found["posterior, 90 % band"][1], posterior[name].quantile(0.5)[rows, a])
+            np.testing.assert_array_equal(
+                found["posterior, 90 % band"][1], posterior[name].quantile(0.5)[rows, a]
+            )
             for index, quantile in enumerate((posterior[name].prior_quantile, posterior[name].quantile)):
                 low, high = band(ax, index)
                 np.testing.assert_allclose(low, quantile(0.05)[rows, a])
@@ -127,7 +129,7 @@ def test_impedance_needs_a_verdict_for_every_panel(posterior, verdicts):
 def test_what_a_log_lacks_is_not_drawn(bare):
     assert set(lines(plot_force(bare).get_axes()[0])) == {"new measurement, 90 % band"}
     assert set(lines(plot_desired_trajectory(bare).get_axes()[0])) == {"hand", "desired, 90 % band"}
-    figure = plot_impedance(bare, ImpedanceModel(load_config("time")).verdicts(bare))
+    figure = plot_impedance(bare, assess(bare, load_config("time")))
     for ax in figure.get_axes():
         assert set(lines(ax)) == {"posterior, 90 % band"}
     assert figure.get_axes()[-1].get_xlabel() == "time [s]"

@@ -1,0 +1,149 @@
+"""Data flows one way: every module imports only from layers below its own."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import bayes_impedance
+
+ROOT = Path(bayes_impedance.__file__).parent
+
+#: From the bottom to the top. Within a layer modules do not know each other, unless FAMILIES says so.
+LAYERS: tuple[frozenset[str], ...] = tuple(
+    map(
+        frozenset,
+        (
+            {"errors"},
+            {"config", "outputs"},
+            {"log", "metrics"},
+            {"readers", "readers.table", "preprocessing"},
+            {"trajectory_mean"},
+            {"kernels", "kernels.stationary", "kernels.derivative", "kernels.warped", "kernels.impedance"},
+            {"features"},
+            {"priors"},
+            {"engines", "engines.dense", "engines.pointwise"},
+            {"training"},
+            {"posterior"},
+            {"identifiability", "baselines", "baselines.naive"},
+            {"model"},
+            {"persistence", "evaluation"},
+            {"__init__"},
+            {"simulation", "simulation.generative", "plotting", "terminal"},
+            {"demo"},
+            {"cli"},
+            {"__main__"},
+        ),
+    )
+)
+
+#: Modules of a layer that import each other, in one order.
+FAMILIES = (
+    ("readers.table", "readers"),
+    ("kernels.stationary", "kernels.derivative", "kernels.warped", "kernels.impedance", "kernels"),
+    ("engines.dense", "engines.pointwise", "engines"),
+    ("baselines.naive", "baselines"),
+    ("simulation.generative", "simulation"),
+)
+
+#: Only the command line and its demo show, draw or simulate anything.
+PRESENTATION = {"cli", "demo", "terminal", "plotting", "simulation", "simulation.generative"}
+
+#: What a kernel may know of this package: other kernels. They are to be taken into other people's code.
+FREE = ("kernels.", "metrics", "errors")
+
+#: Libraries that only some layers may load, for they are slow or have no place elsewhere.
+CONFINED = {
+    "typer": {"cli"},
+    "rich": {"cli", "terminal"},
+    "matplotlib": {"plotting"},
+    "pydantic": {"config"},
+    "yaml": {"config"},
+    "safetensors": {"persistence"},
+    "pyarrow": {"readers.table"},
+}
+
+
+def name_of(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if len(parts) > 1 and parts[-1] == "__init__" else parts)
+
+
+MODULES = {name_of(path): path for path in sorted(ROOT.rglob("*.py"))}
+
+
+def imported(module: str) -> tuple[set[str], set[str]]:
+    """Modules of this package, and names of other packages, that a module imports anywhere."""
+    own: set[str] = set()
+    foreign: set[str] = set()
+    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module}: relative import"
+            # `from bayes_impedance import terminal` imports a module, `from … import Name` one of its names.
+            assert node.module is not None
+            inner = [f"{node.module}.{alias.name}" for alias in node.names]
+            names = [
+                name if name.removeprefix("bayes_impedance.") in MODULES else node.module for name in inner
+            ]
+        else:
+            continue
+        for name in names:
+            first, _, rest = name.partition(".")
+            if first == "bayes_impedance":
+                own.add(rest or "__init__")
+            else:
+                foreign.add(first)
+    return own, foreign
+
+
+def layer(module: str) -> int:
+    return next(index for index, names in enumerate(LAYERS) if module in names)
+
+
+def may_import(module: str, other: str) -> bool:
+    if layer(other) != layer(module):
+        return layer(other) < layer(module)
+    return any(
+        module in family and other in family and family.index(other) < family.index(module)
+        for family in FAMILIES
+    )
+
+
+def test_every_module_has_its_layer():
+    assert set(MODULES) == set().union(*LAYERS)
+    assert sum(map(len, LAYERS)) == len(MODULES)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_imports_point_downwards(module):
+    wrong = [other for other in imported(module)[0] if not may_import(module, other)]
+    assert wrong == []
+
+
+@pytest.mark.parametrize("module", sorted(set(MODULES) - PRESENTATION - {"__main__"}))
+def test_nothing_but_the_command_line_shows_draws_or_simulates(module):
+    assert not imported(module)[0] & PRESENTATION
+
+
+@pytest.mark.parametrize("module", ["errors", "metrics", *(m for m in MODULES if m.startswith("kernels"))])
+def test_foundations_stand_alone(module):
+    assert all(other.startswith(FREE) for other in imported(module)[0])
+
+
+def test_configuration_knows_only_errors():
+    assert imported("config")[0] == {"errors"}
+    assert imported("errors") == (set(), set())
+
+
+@pytest.mark.parametrize("library", CONFINED)
+def test_libraries_are_confined(library):
+    assert {module for module in MODULES if library in imported(module)[1]} == CONFINED[library]
+
+
+def test_nothing_is_pickled():
+    for module in MODULES:
+        assert not imported(module)[1] & {"pickle", "joblib", "dill", "shelve", "marshal"}
+        assert "torch.load" not in MODULES[module].read_text(encoding="utf-8")
+        assert "torch.save" not in MODULES[module].read_text(encoding="utf-8")
