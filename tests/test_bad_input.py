@@ -420,7 +420,7 @@ CASES: dict[str, tuple[Callable[[Bench], Arguments], tuple[str, ...]]] = {
         configured("engine.max_samples=30"),
         (
             r"group '0': expected at most engine\.max_samples = 30 samples .*, got 40,",
-            r"would need about [\d.]+ GB and \d+ s an evaluation",
+            r"would need about [\d.]+ GB and [\d.]+ s an evaluation",
             r"set preprocessing\.rate to thin the log, cut it with log\.window, or raise engine\.max_samples",
         ),
     ),

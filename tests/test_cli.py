@@ -287,7 +287,7 @@ def test_demo_does_not_touch_a_folder_of_somebody_else(command, tmp_path, monkey
         (
             "train",
             (
-                "logs",
+                "LOG",
                 "--config",
                 "--out",
                 "--set",
@@ -296,9 +296,9 @@ def test_demo_does_not_touch_a_folder_of_somebody_else(command, tmp_path, monkey
                 *sorted(cli.shipped_configurations()),
             ),
         ),
-        ("infer", ("model", "logs", "--out", "--given", "both", "training", "log", "--figures", ".parquet")),
-        ("evaluate", ("model", "logs", "--baseline", "naive", "--json")),
-        ("show", ("model", "--json")),
+        ("infer", ("MODEL", "LOG", "--out", "--given", "both", "training", "log", "--figures", ".parquet")),
+        ("evaluate", ("MODEL", "LOG", "--baseline", "naive", "--json")),
+        ("show", ("MODEL", "--json")),
     ],
 )
 def test_help_of_every_command_mentions_its_arguments(command, name, mentions):

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from bayes_impedance.config import load_config
 from bayes_impedance.errors import OutputError
-from bayes_impedance.identifiability import assess, rounded
+from bayes_impedance.identifiability import rounded
 from bayes_impedance.log import InteractionLog
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.plotting import plot_desired_trajectory, plot_force, plot_impedance, save_figures
@@ -28,13 +28,16 @@ def verdicts(tiny, posterior):
 
 @pytest.fixture(scope="module")
 def bare(tiny):
-    """Posterior of a log without force, phase column or truth under a model over time."""
-    config = load_config("time", ["preprocessing.smoother.window=0.14", "preprocessing.rate=10"])
+    """Posterior of a log without force, phase or truth under an untrained model over time, and its verdicts."""
+    levels = [f"model.{name}.level=10" for name in ("stiffness", "damping", "mass")]
+    config = load_config("time", [*levels, "preprocessing.smoother.window=0.14", "preprocessing.rate=10"])
     log = read_log(tiny.other, config.log)
     trial = log.trials[0]
-    return ImpedanceModel(config).posterior(
+    model = ImpedanceModel(config)
+    posterior = model.posterior(
         InteractionLog.from_arrays(trial.time, trial.position, None, axes=log.axes, trial="bare")
     )
+    return posterior, model.verdicts(posterior)
 
 
 def panels(figure: Figure, rows: int, columns: int) -> list[list[Axes]]:
@@ -127,9 +130,10 @@ def test_impedance_needs_a_verdict_for_every_panel(posterior, verdicts):
 
 
 def test_what_a_log_lacks_is_not_drawn(bare):
+    bare, verdicts = bare
     assert set(lines(plot_force(bare).get_axes()[0])) == {"new measurement, 90 % band"}
     assert set(lines(plot_desired_trajectory(bare).get_axes()[0])) == {"hand", "desired, 90 % band"}
-    figure = plot_impedance(bare, assess(bare, load_config("time")))
+    figure = plot_impedance(bare, verdicts)
     for ax in figure.get_axes():
         assert set(lines(ax)) == {"posterior, 90 % band"}
     assert figure.get_axes()[-1].get_xlabel() == "time [s]"
