@@ -124,6 +124,8 @@ def demo(
     with terminal.training_progress(console, recording.config.training, "training") as progress:
         model = model.fit(read_log(recording.training, recording.config.log), progress)
     save_model(model, out / "model")
+    if model.report.interrupted:
+        raise KeyboardInterrupt
     posterior = model.posterior(model.fitted.log)
     verdicts = terminal.print_verdicts(console, model, posterior)
     errors = truth_errors(lambda name: posterior[name].mean, model.fitted.log)

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -55,10 +56,12 @@ def save_model(model: ImpedanceModel, folder: str | Path) -> None:
             "package_version": version("bayes-impedance"),
             "log": fit.log.header(),
             "data_fingerprint": fit.log.fingerprint(),
-            "report": asdict(fit.report),
+            "report": _finite_or_null(asdict(fit.report)),
             "files": {name: _digest(place / name) for name in FILES},
         }
-        (place / METADATA).write_text(json.dumps(metadata, indent=2) + "\n", encoding="utf-8")
+        (place / METADATA).write_text(
+            json.dumps(metadata, indent=2, allow_nan=False) + "\n", encoding="utf-8"
+        )
 
 
 def load_model(folder: str | Path) -> ImpedanceModel:
@@ -104,10 +107,15 @@ def _assemble(place: Path, metadata: Mapping[str, Any]) -> ImpedanceModel:
             entry.raw.copy_(stored)
     report: dict[str, Any] = metadata["report"]
     restarts = tuple(
-        RestartReport(**{**item, **{k: tuple(item[k]) for k in ("objective", "log_likelihood")}})
+        RestartReport(
+            **{**item, **{k: tuple(_numbers(item[k], -math.inf)) for k in ("objective", "log_likelihood")}}
+        )
         for item in report["restarts"]
     )
-    lists = {key: tuple(report[key]) for key in ("best", "log_likelihood", "objective")}
+    lists: dict[str, Any] = {key: tuple(report[key]) for key in ("best", "log_likelihood", "objective")}
+    lists["log_sd"] = {
+        name: [_numbers(row, math.nan) for row in rows] for name, rows in report["log_sd"].items()
+    }
     return ImpedanceModel(
         config, Fit(force_model, log, TrainingReport(**{**report, **lists, "restarts": restarts}))
     )
@@ -139,6 +147,19 @@ def _metadata(place: Path) -> dict[str, Any]:
             f"bayes_impedance {metadata.get('package_version', 'of unknown version')}; update bayes_impedance"
         )
     return {**metadata, "files": files}
+
+
+def _finite_or_null(tree: Any) -> Any:
+    """JSON has no NaN (a hyperparameter that is fixed or not determined) and no −∞ (a restart that failed)."""
+    if isinstance(tree, Mapping):
+        return {key: _finite_or_null(value) for key, value in tree.items()}
+    if isinstance(tree, (list, tuple)):
+        return [_finite_or_null(value) for value in tree]
+    return None if isinstance(tree, float) and not math.isfinite(tree) else tree
+
+
+def _numbers(values: Sequence[float | None], null: float) -> list[float]:
+    return [null if value is None else value for value in values]
 
 
 def _digest(path: Path) -> str:

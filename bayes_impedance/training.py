@@ -118,7 +118,13 @@ def train(
             raise failure
         raise KeyboardInterrupt
     search.restore()
-    log_sd = _laplace(search) if not interrupted else {}
+    log_sd: dict[str, list[list[float]]] = {}
+    if not interrupted:
+        try:
+            log_sd = _laplace(search)
+        except KeyboardInterrupt:
+            interrupted = True
+            search.restore()
     return TrainingReport(
         restarts=tuple(reports),
         best=tuple(int(r) for r in search.best_restart),

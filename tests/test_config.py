@@ -22,18 +22,8 @@ from bayes_impedance.errors import ConfigurationError
 
 SHIPPED = shipped_configurations()
 
+
 #: Keys that time.yaml does not show: they act only with another kernel, mean, prior or input.
-NOT_IN_TIME = {
-    "model.desired_trajectory.shape",
-    "model.desired_trajectory.value",
-    "model.desired_trajectory.average_knots",
-    "model.stiffness.sd",
-    "model.stiffness.length_scale",
-    "model.damping.sd",
-    "model.damping.length_scale",
-}
-
-
 def keys(section: type[Section], prefix: str = "") -> set[str]:
     """Dotted keys of the schema; a hyperparameter and its length scales count as one each."""
     found = set()
@@ -111,7 +101,7 @@ def test_every_scale_in_time_yaml_says_its_unit():
 def test_time_yaml_holds_every_key_of_the_schema():
     known = keys(Config)
     content = yaml.safe_load(SHIPPED["time"].read_text(encoding="utf-8"))
-    assert known - stated(content, known) == NOT_IN_TIME
+    assert known - stated(content, known) == set()
 
 
 def test_time_yaml_holds_the_defaults_except_for_the_rate():
@@ -122,18 +112,6 @@ def test_time_yaml_holds_the_defaults_except_for_the_rate():
         assert getattr(shipped.model, name).scale == getattr(default.model, name).scale
     implicit = ["preprocessing.rate=null", "model.stiffness.log_sd=null", "model.damping.log_sd=null"]
     assert load_config("time", implicit) == default
-
-
-@pytest.mark.parametrize("name", sorted(set(SHIPPED) - {"time"}))
-def test_values_of_other_files_are_commented_keys_of_time_yaml(name):
-    """They refer to time.yaml for what they leave out, so they may not know more than it explains."""
-    known = keys(Config)
-    content = yaml.safe_load(SHIPPED[name].read_text(encoding="utf-8"))
-    mentioned = stated(content, known) & NOT_IN_TIME
-    text = SHIPPED[name].read_text(encoding="utf-8")
-    for key in mentioned:
-        leaf = key.rsplit(".", 1)[1]
-        assert re.search(rf"^\s+{leaf}:", text, re.MULTILINE)
 
 
 def test_unknown_name_lists_or_suggests_the_shipped_ones(tmp_path):

@@ -385,7 +385,7 @@ def test_table_of_the_posterior(two_logs: tuple[Config, PreparedLog, PreparedLog
     config, first, _ = two_logs
     posterior = ImpedanceModel(config).posterior(first)
     table = posterior.table()
-    vectors = ("force", "residual_force", *TRAJECTORY)
+    vectors = ("force", *TRAJECTORY, "residual_force")
     expected = [f"{q}_{axis}_{end}" for q in vectors for axis in "xy" for end in ("mean", "sd", "q05", "q95")]
     expected += [f"{q}_{a}{a}_{end}" for q in IMPEDANCE for a in "xy" for end in ("mean", "sd", "q05", "q95")]
     assert list(table.columns) == ["trial", "time", *expected]

@@ -12,7 +12,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from bayes_impedance.config import Columns, LogConfig, Units, Window
-from bayes_impedance.errors import LogError
+from bayes_impedance.errors import LogError, LogWarning
 from bayes_impedance.readers import read_log
 
 SEPARATORS = {".csv": ",", ".tsv": "\t", ".txt": " "}
@@ -144,12 +144,31 @@ def test_mapping_units_and_direction(tmp_path):
 def test_axes_are_those_with_position_and_force(tmp_path):
     table = frame(axes="xy").drop(columns="force_x")
     path = write(table, tmp_path / "a.csv")
-    assert read_log(path).axes == ("y",)
+    with pytest.warns(
+        LogWarning, match="axis x has a column 'position_x' but none named 'force_x'.*log.axes"
+    ):
+        assert read_log(path).axes == ("y",)
     assert read_log(path, LogConfig(axes=("y",))).axes == ("y",)
     with pytest.raises(LogError, match=r"a.csv: expected column 'force_x'"):
         read_log(path, LogConfig(axes=("x", "y")))
     with pytest.raises(LogError, match=r"expected column 'force_x', .* set log.columns.force to the name"):
         read_log(path, LogConfig(axes=("x", "y")), require_force=False)
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong"), [("position_x", "positon_x"), ("force_x", "Force_x"), ("force_x", "forcex")]
+)
+def test_a_misspelt_column_does_not_drop_its_axis(tmp_path, right, wrong):
+    path = write(frame(axes="xy").rename(columns={right: wrong}), tmp_path / "a.csv")
+    for require_force in (True, False):
+        with pytest.raises(LogError, match=rf"expected column '{right}', .*the nearest is '{wrong}'"):
+            read_log(path, require_force=require_force)
+
+
+def test_misspelt_forces_are_not_taken_for_none(tmp_path):
+    table = frame(axes="xy").rename(columns={"force_x": "forces_x", "force_y": "forces_y"})
+    with pytest.raises(LogError, match=r"expected column 'force_x', .*the nearest is 'forces_x'"):
+        read_log(write(table, tmp_path / "a.csv"), require_force=False)
 
 
 def test_force_may_be_absent_only_when_not_required(tmp_path):

@@ -27,10 +27,10 @@ class Latent(Enum):
     """Quantities that have a posterior; the value is the name users see."""
 
     FORCE = "force"
-    RESIDUAL_FORCE = "residual_force"
     DESIRED_POSITION = "desired_position"
     DESIRED_VELOCITY = "desired_velocity"
     DESIRED_ACCELERATION = "desired_acceleration"
+    RESIDUAL_FORCE = "residual_force"
     STIFFNESS = "stiffness"
     DAMPING = "damping"
     MASS = "mass"

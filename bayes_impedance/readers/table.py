@@ -6,6 +6,7 @@ import csv
 import difflib
 import io
 import re
+import warnings
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from bayes_impedance.config import Columns, LogConfig
-from bayes_impedance.errors import LogError
+from bayes_impedance.errors import LogError, LogWarning
 from bayes_impedance.log import (
     AXES,
     TRUTH_COLUMN,
@@ -322,7 +323,32 @@ def _axes(table: _Table, config: LogConfig, require_force: bool) -> tuple[str, .
     measured = [axis for axis in moving if _of_axis(config.columns.force, axis) in table.columns]
     if not measured and require_force:
         raise _missing(table, "force", _of_axis(config.columns.force, moving[0]))
+    _question_half_axes(table, config.columns, forceless=not measured)
     return tuple(measured or moving)
+
+
+def _question_half_axes(table: _Table, columns: Columns, forceless: bool) -> None:
+    """An axis with position or force alone is a misspelling where a name is near (LogError), else a warning."""
+    known = {
+        _of_axis(getattr(columns, key), axis) for key in VECTORS for axis in AXES if getattr(columns, key)
+    }
+    others = [name for name in table.columns if name not in known]
+    for axis in AXES:
+        names = {key: _of_axis(getattr(columns, key), axis) for key in ("position", "force")}
+        absent = [key for key, name in names.items() if name not in table.columns]
+        if len(absent) != 1:
+            continue
+        (key,) = absent
+        if difflib.get_close_matches(names[key], others, n=1, cutoff=0.85):
+            raise _missing(table, key, names[key])
+        if not forceless:
+            (present,) = set(names) - {key}
+            warnings.warn(
+                f"{table.source}: axis {axis} has a column {names[present]!r} but none named {names[key]!r}, so it "
+                "is left out; name the axes that are meant in log.axes",
+                LogWarning,
+                stacklevel=2,
+            )
 
 
 def _wanted(
