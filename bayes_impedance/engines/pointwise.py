@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from gpytorch.kernels import AdditiveKernel, Kernel
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
+from scipy.linalg.blas import dtrsv
 from torch import Tensor
 
 from bayes_impedance.engines.dense import Factor, Observations
-from bayes_impedance.kernels.derivative import Forms, combine
+from bayes_impedance.kernels.derivative import Forms, Table, combine
 from bayes_impedance.kernels.impedance import InteractionKernel, force_covariance
 from bayes_impedance.kernels.stationary import StationaryKernel
 from bayes_impedance.kernels.warped import ImpedanceProcess
@@ -44,8 +44,7 @@ class PointPredictor:
         factor = Factor(kernel, observations, jitter)
         inputs = observations.inputs.numpy()
         self._alpha = factor.alpha.numpy()
-        n = len(self._alpha)
-        self._inverse = solve_triangular(factor.cholesky.numpy(), np.eye(n), lower=True)
+        self._cholesky = np.asfortranarray(factor.cholesky.numpy())
         self._noise = float(observations.noise_variance.detach())
         impedance = kernel.impedance
         self._layout = impedance.layout
@@ -66,7 +65,7 @@ class PointPredictor:
 
     def predict(self, x: Array) -> tuple[float, float]:
         """E and Var of a new measurement of force [N, N²] at the inputs `x` `(D,)`, levels taken as known."""
-        common, table = self._trajectory.table(x)
+        common, table, own, own_table = self._trajectory.table(x)
         rows = self._rows(x)
         count = len(self._processes)
         covariance = {(j, j): process.covariance(rows[j]) for j, process in enumerate(self._processes)}
@@ -77,86 +76,95 @@ class PointPredictor:
             cross = cross + (
                 row if self._labels is None else row * (self._labels == x[self._layout.residual])
             )
-        own, own_table = self._trajectory.own(x)
         prior = self._residual_variance
         prior += force_covariance(weights, weights, self._variances, own_table, own, errors, errors)
-        white = self._inverse @ cross
+        # On one thread, unlike a product with the inverse: waking another can cost milliseconds.
+        white = dtrsv(self._cholesky, cross, lower=1)
         mean = cross @ self._alpha
         if errors is not None:
             mean += sum(e * w for e, w in zip(errors, weights, strict=True))
-        return float(mean), float(max(prior - white @ white, 0.0) + self._noise)
+        return float(mean), float(max(prior - float(white @ white), 0.0) + self._noise)
+
+
+#: Coefficients of the forms s10, s01, s11, s20, s02, s21, s12, s22, s (rows) on θ', a', b' of the training
+#: samples (blocks) are −P times θ, a or b of the sample: (row, block, which).
+THETA, VELOCITY, ACCELERATION = 0, 1, 2
+COEFFICIENTS = np.array(
+    [
+        (0, THETA, VELOCITY), (1, VELOCITY, THETA), (2, VELOCITY, VELOCITY), (3, THETA, ACCELERATION),
+        (4, ACCELERATION, THETA), (5, VELOCITY, ACCELERATION), (6, ACCELERATION, VELOCITY),
+        (7, ACCELERATION, ACCELERATION), (8, THETA, THETA),
+    ]
+).T  # fmt: skip
 
 
 class _Trajectory:
     """Derivatives of k_xd between one sample and the training samples."""
 
     def __init__(self, kernel: InteractionKernel, inputs: Array) -> None:
-        trajectory, self.layout = kernel.impedance.trajectory, kernel.impedance.layout
+        trajectory, layout = kernel.impedance.trajectory, kernel.impedance.layout
         _check(trajectory)
         self.profile, self.order = trajectory.profile, kernel.impedance.order
-        self.precision = _scalar_row(trajectory.precision, len(self.layout.theta))
+        self.precision = _scalar_row(trajectory.precision, len(layout.theta))
         self.variance = float(trajectory.sd.detach() ** 2)
         self.shape = None if trajectory.shape is None else trajectory.shape.detach().reshape(())
-        self.labels = None if self.layout.trajectory is None else inputs[:, self.layout.trajectory]
-        layout = self.layout
+        self.label = layout.trajectory
+        self.labels = None if self.label is None else inputs[:, self.label]
         self.has_acceleration = bool(layout.theta_acceleration)
         self.columns = [_columns(c) for c in (layout.theta, layout.theta_velocity, layout.theta_acceleration)]
-        self.centre = inputs[:, self.columns[0]].mean(axis=0)
-        self.theta, a, b = self._path(inputs)
-        weighted = self.theta * self.precision
-        p = len(self.precision)
-        self.slices = {name: slice(k * p, (k + 1) * p) for k, name in enumerate(("theta", "a", "b"))}
-        speed = (a * self.precision * a).sum(1)
-        half = 0.5 * (self.theta * weighted).sum(1)
-        turned = [(a * weighted).sum(1), (b * weighted).sum(1)]
-        columns = [self.theta, a, b, *turned, speed, np.ones(len(inputs)), half]
-        self.kept = np.column_stack(columns).T.copy()
-        self.last = 3 * p
-        self.coefficients = np.zeros((9, len(self.kept)))
+        self.centre = inputs[:, self.columns[THETA]].mean(axis=0)
+        theta, a, b = np.moveaxis(self._path(inputs), -2, 0)
+        self.theta = theta
+        weighted = theta * self.precision
+        # Columns: θ', a', b', then what the forms add without a factor of the sample.
+        extra = [(a * weighted).sum(1), (b * weighted).sum(1), (a * self.precision * a).sum(1)]
+        extra += [0.5 * (theta * weighted).sum(1), np.ones(len(inputs))]
+        self.kept = np.column_stack([theta, a, b, *extra]).T.copy()
+        self.constant = np.zeros((9, len(self.kept)))
+        for row, column in ((1, -5), (4, -4), (4, -3), (8, -2)):
+            self.constant[row, column] = 1.0
 
-    def table(self, x: Array) -> tuple[Array, list[list[Any]]]:
-        theta, a, b = self._path(x)
-        pt, pa, pb = self.precision * theta, self.precision * a, self.precision * b
-        c, s, end = self.coefficients, self.slices, self.last
-        # Rows: s10, s01, s11, s20, s02, s21, s12, s22, s; columns: θ', a', b', a'ᵀPθ', b'ᵀPθ', A', 1, ½θ'ᵀPθ'.
-        c[0, s["theta"]], c[0, end + 3] = -pa, a @ pt
-        c[1, s["a"]], c[1, end] = -pt, 1.0
-        c[2, s["a"]] = -pa
-        c[3, s["theta"]], c[3, end + 3] = -pb, a @ pa + b @ pt
-        c[4, s["b"]], c[4, end + 1], c[4, end + 2] = -pt, 1.0, 1.0
-        c[5, s["a"]], c[6, s["b"]], c[7, s["b"]] = -pb, -pa, -pb
-        c[8, s["theta"]], c[8, end + 3], c[8, end + 4] = -pt, 0.5 * (theta @ pt), 1.0
-        s10, s01, s11, s20, s02, s21, s12, s22, half = c @ self.kept
+    def table(self, x: Array) -> tuple[Any, Table, Any, Table]:
+        """Common factor and table against the training samples, then at the sample itself."""
+        path = self._path(x)
+        minus = -self.precision * path
+        gram = (path @ minus.T).tolist()
+        c = self.constant.copy()
+        rows, blocks, which = COEFFICIENTS
+        c[:, : path.size].reshape(9, *path.shape)[rows, blocks] = minus[which]
+        c[0, -1] = -gram[VELOCITY][THETA]
+        c[3, -1] = -gram[VELOCITY][VELOCITY] - gram[ACCELERATION][THETA]
+        c[8, -1] = -0.5 * gram[THETA][THETA]
+        s10, s01, s11, s20, s02, s21, s12, s22, s = c @ self.kept
         if self.profile.exact_distance:
-            half = 0.5 * (theta - self.theta) ** 2 @ self.precision
+            s = 0.5 * (path[THETA] - self.theta) ** 2 @ self.precision
         third = (s21, s12, s22) if self.has_acceleration else (None, None, None)
-        common, table = self._combine(Forms(half, s10, s01, s11, s20, s02, *third))
+        common, table = self._combine(Forms(s, s10, s01, s11, s20, s02, *third))
         if self.labels is not None:
-            common = common * (self.labels == x[self.layout.trajectory])
-        return common, table
+            common = common * (self.labels == x[self.label])
+        s11, s12, s22 = (
+            gram[VELOCITY][VELOCITY],
+            gram[VELOCITY][ACCELERATION],
+            gram[ACCELERATION][ACCELERATION],
+        )
+        third = (s12, s12, s22) if self.has_acceleration else (None, None, None)
+        return common, table, *self._combine(Forms(0.0, 0.0, 0.0, s11, -s11, -s11, *third))
 
-    def own(self, x: Array) -> tuple[Any, list[list[Any]]]:
-        """The same at the sample itself."""
-        _, a, b = self._path(x)
-        weighted = self.precision * b
-        aa, ab, bb = float(a @ (self.precision * a)), float(a @ weighted), float(b @ weighted)
-        third = (-ab, -ab, -bb) if self.has_acceleration else (None, None, None)
-        forms = Forms(0.0, 0.0, 0.0, -aa, aa, aa, *third)
-        if self.profile.is_exponential:
-            return self.variance, combine(self.profile, forms, (), self.order)
-        return self._combine(forms)
-
-    def _combine(self, forms: Forms) -> tuple[Any, list[list[Any]]]:
+    def _combine(self, forms: Forms) -> tuple[Any, Table]:
         if self.profile.is_exponential:
             return self.variance * np.exp(-forms.s), combine(self.profile, forms, (), self.order)
         common, ratios = self.profile.derivatives(torch.as_tensor(forms.s, dtype=torch.float64), self.shape)
         plain = tuple(ratio.numpy() if isinstance(ratio, Tensor) else ratio for ratio in ratios)
         return self.variance * common.numpy(), combine(self.profile, forms, plain, self.order)
 
-    def _path(self, x: Array) -> tuple[Array, Array, Array]:
-        velocity = x[..., self.columns[1]]
-        acceleration = x[..., self.columns[2]] if self.has_acceleration else np.zeros_like(velocity)
-        return x[..., self.columns[0]] - self.centre, velocity, acceleration
+    def _path(self, x: Array) -> Array:
+        """θ (from its centre), θ̇ and θ̈, `(..., 3, p)`."""
+        path = np.zeros((*x.shape[:-1], 3, len(self.precision)))
+        path[..., THETA, :] = x[..., self.columns[THETA]] - self.centre
+        path[..., VELOCITY, :] = x[..., self.columns[VELOCITY]]
+        if self.has_acceleration:
+            path[..., ACCELERATION, :] = x[..., self.columns[ACCELERATION]]
+        return path
 
 
 class _Stationary:
