@@ -27,11 +27,12 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 def pytest_sessionfinish(exitstatus: int) -> None:
     if exitstatus != 0 or not FIGURES:
         return
+    path = Path(__file__).with_name("results.json")
+    earlier = json.loads(path.read_text(encoding="utf-8"))["figures"] if path.is_file() else {}
     record = {
         "command": "make bench",
         "versions": {name: version(name) for name in ("bayes-impedance", "torch", "gpytorch", "numpy")},
         "machine": {"processor": platform.machine(), "python": platform.python_version()},
-        "figures": FIGURES,
+        "figures": earlier | FIGURES,
     }
-    path = Path(__file__).with_name("results.json")
     path.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
