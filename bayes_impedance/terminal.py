@@ -56,11 +56,16 @@ def verdict_table(verdicts: Sequence[Verdict]) -> Table:
 
 
 def print_verdicts(console: Console, model: ImpedanceModel, posterior: Posterior) -> list[Verdict]:
-    """The table, then a sentence for each, then what they all presuppose."""
+    """The table, then the sentences, then what they all presuppose."""
     verdicts = model.verdicts(posterior)
     console.print(verdict_table(verdicts))
+    # Parameters of which the same is to be said share a line.
+    said: dict[str, list[str]] = {}
     for verdict in verdicts:
-        console.print(f"  {verdict.sentence}", highlight=False)
+        name, _, rest = verdict.sentence.partition(": ")
+        said.setdefault(rest, []).append(name)
+    for rest, names in said.items():
+        console.print(f"  {', '.join(names)}: {rest}", highlight=False)
     remark = caveat(verdicts, posterior, model.config)
     if remark:
         console.print(f"  {remark}", style="yellow", highlight=False)

@@ -76,7 +76,12 @@ def test_train_writes_the_model_and_says_what_the_data_support(command, tiny, tm
     assert (done.code, done.err) == (0, "")
     assert "training on 40 samples of 2 trials, axes x, y" in done.out
     assert re.search(r"stiffness xx \[N/m\].*…", done.out)
-    assert "stiffness yy: " in done.out
+    # Each parameter stands in exactly one sentence that ends in its verdict's reason.
+    sentences = " ".join(done.out.split("contraction", 1)[1].split("└", 1)[1].split())
+    for latent in ("stiffness", "damping", "mass"):
+        for axis in "xy":
+            assert sentences.count(f"{latent} {axis}{axis}") == 1
+    assert re.search(r"stiffness yy[^:]*: (supported|weakly supported|prior only)", sentences)
     assert "Restarts of the optimiser" in done.out
     assert (
         f"wrote {tmp_path / 'model'}; look at it with: bayes-impedance show {tmp_path / 'model'}\n"
