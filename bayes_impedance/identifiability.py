@@ -1,4 +1,4 @@
-"""Verdict on every impedance estimate: do these data support it, or is it the prior (DESIGN §7)?"""
+"""Verdict on every impedance estimate: do these data support it, or is it the prior (docs/model.md §6)?"""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def classify(contraction: float) -> Support:
 
 
 def confounding(config: Config, repetitions: int) -> str | None:
-    """Why this design cannot tell impedance from the desired trajectory; None where it can (DESIGN §7).
+    """Why this design cannot tell impedance from the desired trajectory; None where it can (docs/model.md §6).
 
     It can where the desired trajectory is known (`reference`), or where several repetitions, displaced in
     different ways, share one as a function of phase or time. A function of position takes the value x + u/k for any

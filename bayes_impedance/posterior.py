@@ -1,4 +1,4 @@
-"""Gaussian posteriors of every latent, given forces (DESIGN §5).
+"""Gaussian posteriors of every latent, given forces (docs/model.md §4).
 
 The covariance between the force and another process is the primitive: predicting x_d is the same code as
 predicting u. Warped impedance is conditioned in the logarithm, so its quantiles are positive.

@@ -1,4 +1,4 @@
-"""Prior mean of the desired trajectory and its time derivatives (DESIGN §2, §4).
+"""Prior mean of the desired trajectory and its time derivatives (docs/model.md §1).
 
 μ_xd and its first two time derivatives, for `equilibrium` (the hand itself), `reference` (a column of the
 log), `trial_average` (the mean over repetitions at equal phase) and `constant`.

@@ -153,7 +153,7 @@ def test_a_linear_law_survives_smoothing(window):
 
 
 def test_smoothing_both_sides_keeps_the_stiffness():
-    # DESIGN §7: micrometre noise, differentiated twice without a filter, swamps acceleration and with it k.
+    # docs/model.md §6: micrometre noise, differentiated twice without a filter, swamps acceleration and with it k.
     rng = np.random.default_rng(3)
     time = np.arange(4000) * 0.001
     omega = 2 * np.pi * np.array([0.7, 1.9, 3.1])[:, None]

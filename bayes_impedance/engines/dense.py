@@ -1,4 +1,4 @@
-"""Exact inference with dense covariance matrices, formed in row blocks (DESIGN §8).
+"""Exact inference with dense covariance matrices, formed in row blocks (docs/model.md §7).
 
 Plain autograd keeps every intermediate n × n matrix of the kernel. Here the covariance is filled block
 by block without a graph, and the backward pass forms each block again, with one, to contract it with

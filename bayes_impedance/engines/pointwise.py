@@ -1,7 +1,7 @@
 """Force at one sample, given forces: everything that does not depend on the sample is computed beforehand.
 
 Calls of torch on vectors of a few hundred entries cost more than the arithmetic. Here the sums of
-`kernels` run on NumPy vectors: the bilinear forms of DESIGN §4 between one sample and all training samples
+`kernels` run on NumPy vectors: the bilinear forms of docs/model.md §3 between one sample and all training samples
 are one small matrix times a matrix kept from training.
 """
 

@@ -1,4 +1,4 @@
-"""Time derivatives of a stationary covariance along recorded paths θ(t), by the chain rule (DESIGN §4).
+"""Time derivatives of a stationary covariance along recorded paths θ(t), by the chain rule (docs/model.md §3).
 
 ∂_tⁱ ∂_t'ʲ k(θ(t), θ(t')) for i, j ≤ 2 is κ and its derivatives times bilinear forms of θ, a = dθ/dt and
 b = d²θ/dt². The forms are thin matrix products; the rest is one pass over the n × n' entries.

@@ -1,4 +1,4 @@
-"""The covariance that impedance priors give the interaction force (DESIGN §3; paper (13)–(15)).
+"""The covariance that impedance priors give the interaction force (docs/model.md §2; paper (13)–(15)).
 
 With w = (k, d, m), ē_j = E[e⁽ʲ⁾] and C_ij = Cov[w_i, w_j'], independent of x_d and ũ:
 
@@ -99,7 +99,7 @@ def force_covariance(
     error1: Sequence[Any] | None = None,
     error2: Sequence[Any] | None = None,
 ) -> Any:
-    """Σ_ij (E_i E_j' + C_ij) D_ij + Σ_ij C_ij ē_i ē_j', D_ij = `common` · `table[i][j]` (DESIGN §3).
+    """Σ_ij (E_i E_j' + C_ij) D_ij + Σ_ij C_ij ē_i ē_j', D_ij = `common` · `table[i][j]` (docs/model.md §2).
 
     `expectation1[i]` E_i broadcasts as `(..., n1, 1)`, `expectation2[j]` as `(..., 1, n2)`, `error1` and
     `error2` alike; `covariance[i, j]` C_ij is `(..., n1, n2)`, absent pairs are independent.
@@ -220,7 +220,7 @@ class ImpedanceKernel(BatchedKernel):
         return common * table[order][order]
 
     def impedance_covariance(self, x1: Tensor, x2: Tensor, order: int) -> Tensor:
-        """Cov[u, g_j'] = ē_j · sensitivity_j · k_w, with g_j = w_j, or log w_j where warped (DESIGN §5, §6)."""
+        """Cov[u, g_j'] = ē_j · sensitivity_j · k_w, with g_j = w_j, or log w_j where warped (docs/model.md §4, §5)."""
         process = self.processes[order]
         k = process.gaussian_covariance(x1, x2)
         errors = self.layout.errors(x1, self.order)
@@ -298,7 +298,7 @@ class InteractionKernel(BatchedKernel):
         return self.impedance.prior_mean(x)
 
     def cross_covariance(self, x1: Tensor, x2: Tensor, latent: Latent) -> Tensor:
-        """Cov[u(x1), latent(x2)], `(..., n1, n2)`; warped impedance enters by its logarithm (DESIGN §5)."""
+        """Cov[u(x1), latent(x2)], `(..., n1, n2)`; warped impedance enters by its logarithm (docs/model.md §4)."""
         if latent is Latent.FORCE:
             return self.forward(x1, x2)
         if latent is Latent.RESIDUAL_FORCE:

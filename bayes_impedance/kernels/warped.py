@@ -1,7 +1,7 @@
 """Priors of mass, damping and stiffness: Gaussian processes, or their exponentials, with closed moments.
 
 Log-Gaussian: log w ~ GP(log μ_w, k_w), so E[w] = μ_w exp(k_w(ξ,ξ)/2) and
-Cov[w, w'] = E[w] E[w'] (exp k_w(ξ,ξ') − 1); μ_w is the median (DESIGN §6).
+Cov[w, w'] = E[w] E[w'] (exp k_w(ξ,ξ') − 1); μ_w is the median (docs/model.md §5).
 """
 
 from __future__ import annotations
