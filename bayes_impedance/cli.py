@@ -16,13 +16,13 @@ from rich.markup import escape
 
 from bayes_impedance import terminal
 from bayes_impedance.config import load_config, shipped_configurations
-from bayes_impedance.demo import prepare_folder, record, truth_errors
+from bayes_impedance.demo import record, truth_errors
 from bayes_impedance.errors import BayesImpedanceError, LogWarning, OutputError
 from bayes_impedance.evaluation import as_json, evaluate
 from bayes_impedance.identifiability import summarise
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.model import ImpedanceModel
-from bayes_impedance.outputs import check_replaceable, check_writable, whole_file
+from bayes_impedance.outputs import check_replaceable, check_writable, prepare_folder, whole_file
 from bayes_impedance.persistence import METADATA, load_model, save_model
 from bayes_impedance.plotting import plot_force, save_figure, save_figures
 from bayes_impedance.posterior import Posterior

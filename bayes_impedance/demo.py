@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 
 from bayes_impedance.config import Config, load_config, parse_config
-from bayes_impedance.errors import OutputError
 from bayes_impedance.log import InteractionLog
 from bayes_impedance.outputs import whole_file
 from bayes_impedance.preprocessing import PreparedLog
@@ -49,16 +48,12 @@ def record(folder: Path, seed: int = 0) -> Recording:
     motion = repeated_motion(
         repetitions=REPETITIONS, duration=4.0, rate=100.0, displacement_sd=0.012, seed=seed
     )
-    log = as_recording(_drawn(motion, seed))
+    log = as_recording(draw_force(parse_config(TRUTH), motion, seed))
     training, testing = folder / "training.csv", folder / "testing.csv"
     write_log(log.select(range(REPETITIONS - 1)), training)
     write_log(log.select([REPETITIONS - 1]), testing)
     # Half the usual rate: the displacements end at 2 Hz, and the demo should end within a minute.
     return Recording(training, testing, load_config("phase", ["preprocessing.rate=12.5"]))
-
-
-def _drawn(motion: PreparedLog, seed: int) -> PreparedLog:
-    return draw_force(parse_config(TRUTH), motion, seed)
 
 
 def write_log(log: InteractionLog, path: Path) -> None:
@@ -92,17 +87,3 @@ def truth_errors(posterior_of: Callable[[str], np.ndarray], log: PreparedLog) ->
             truth = np.concatenate([trial.truth[key] for trial in log.trials])
             errors[key] = float(np.mean(np.abs(estimate[:, a] - truth) / truth))
     return errors
-
-
-def prepare_folder(folder: Path) -> None:
-    """Make the folder that receives everything.
-
-    Raises:
-        OutputError: it cannot be made.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"{folder}: could not be created: {error.strerror}; choose another place"
-        ) from error

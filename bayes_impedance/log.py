@@ -8,7 +8,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -75,8 +75,74 @@ class Trial:
         return f"Trial({self.name!r}, group={self.group!r}, source={self.source!r}, {self.n_samples} samples)"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class InteractionLog:
+class _Recorded(Protocol):
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def group(self) -> str: ...
+
+    @property
+    def source(self) -> str: ...
+
+    @property
+    def n_samples(self) -> int: ...
+
+
+T = TypeVar("T", bound=_Recorded)
+
+
+class TrialSet(Generic[T]):
+    """What raw and prepared logs have in common: trials that share their axes, and what is asked of them."""
+
+    __slots__ = ()
+
+    axes: tuple[str, ...]
+    trials: tuple[T, ...]
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Groups in order of appearance."""
+        return tuple(dict.fromkeys(trial.group for trial in self.trials))
+
+    @property
+    def n_samples(self) -> int:
+        """Number of samples of all trials together."""
+        return sum(trial.n_samples for trial in self.trials)
+
+    def select(self, which: Callable[[T], bool] | Sequence[int]) -> Self:
+        """Log of the trials that fulfil a predicate or have these indices, in the order given.
+
+        Raises LogError when that leaves no trial or an index does not exist.
+        """
+        chosen = chosen_trials(self.trials, which)
+        # Past the constructor: the trials are checked, and an axis may well rest in a part of a log.
+        log = object.__new__(type(self))
+        object.__setattr__(log, "axes", self.axes)
+        object.__setattr__(log, "trials", chosen)
+        return log
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Every array by name, such as `trials.3.position` or `trials.3.truth.stiffness_xx`."""
+        return {
+            f"trials.{index}.{name}": array
+            for index, trial in enumerate(self.trials)
+            for name, array in trial_arrays(trial).items()
+        }
+
+    def fingerprint(self) -> str:
+        """SHA-256 (hex) of axes, names, groups and arrays; where the files lie does not matter."""
+        names = [[trial.name, trial.group] for trial in self.trials]
+        return digest({"axes": self.axes, "trials": names}, self.arrays())
+
+    def __repr__(self) -> str:
+        """Axes and sizes."""
+        sizes = f"{len(self.trials)} trials, {self.n_samples} samples"
+        return f"{type(self).__name__}(axes={''.join(self.axes)}, {sizes})"
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class InteractionLog(TrialSet[Trial]):
     """Trials that share their axes; arrays are float64, C-contiguous and read-only.
 
     Raises LogError when a trial is not a valid recording, and warns (LogWarning) when a range looks like
@@ -154,57 +220,8 @@ class InteractionLog:
                 )
         return cls(logs[0].axes, tuple(trial for log in logs for trial in log.trials))
 
-    @property
-    def groups(self) -> tuple[str, ...]:
-        """Groups in order of appearance."""
-        return tuple(dict.fromkeys(trial.group for trial in self.trials))
-
-    @property
-    def n_samples(self) -> int:
-        """Number of samples of all trials together."""
-        return sum(trial.n_samples for trial in self.trials)
-
-    def select(self, which: Callable[[Trial], bool] | Sequence[int]) -> InteractionLog:
-        """Log of the trials that fulfil a predicate or have these indices, in the order given.
-
-        Raises LogError when that leaves no trial or an index does not exist.
-        """
-        chosen = chosen_trials(self.trials, which)
-        # Past the constructor: the trials are checked, and an axis may well rest in a part of a log.
-        log = object.__new__(InteractionLog)
-        object.__setattr__(log, "axes", self.axes)
-        object.__setattr__(log, "trials", chosen)
-        return log
-
-    def fingerprint(self) -> str:
-        """SHA-256 (hex) of axes, names, groups and arrays; where the files lie does not matter."""
-        names = [[trial.name, trial.group] for trial in self.trials]
-        arrays = {
-            f"trials.{index}.{name}": array
-            for index, trial in enumerate(self.trials)
-            for name, array in trial_arrays(trial).items()
-        }
-        return digest({"axes": self.axes, "trials": names}, arrays)
-
-    def __repr__(self) -> str:
-        """Axes and sizes."""
-        return (
-            f"InteractionLog(axes={''.join(self.axes)}, {len(self.trials)} trials, {self.n_samples} samples)"
-        )
-
 
 # --- shared with prepared logs -------------------------------------------------------------------
-
-
-class _Named(Protocol):
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def source(self) -> str: ...
-
-
-T = TypeVar("T", bound=_Named)
 
 
 def chosen_trials(trials: Sequence[T], which: Callable[[T], bool] | Sequence[int]) -> tuple[T, ...]:
@@ -430,7 +447,7 @@ def _check_phase(trial: Trial, phase: Array, repetition: Integers) -> None:
 # --- checks of a log -----------------------------------------------------------------------------
 
 
-def _check_names(trials: Sequence[_Named]) -> None:
+def _check_names(trials: Sequence[_Recorded]) -> None:
     seen: set[tuple[str, str]] = set()
     for trial in trials:
         if (trial.source, trial.name) in seen:

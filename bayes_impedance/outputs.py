@@ -32,6 +32,20 @@ def check_writable(path: Path) -> None:
         ) from error
 
 
+def prepare_folder(folder: Path) -> None:
+    """Make a folder that files are to go into, where there is none.
+
+    Raises:
+        OutputError: it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"{folder}: could not be created: {error.strerror}; choose another place"
+        ) from error
+
+
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """A temporary file beside `path` that replaces it when the block ends well, else vanishes.

@@ -6,7 +6,7 @@ verdict, so that no stiffness is looked at without it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -19,6 +19,7 @@ from bayes_impedance.identifiability import Verdict, rounded
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
 from bayes_impedance.outputs import whole_file
 from bayes_impedance.posterior import UNITS, Marginal, Posterior
+from bayes_impedance.preprocessing import PreparedTrial
 
 Array = NDArray[np.float64]
 Share = Literal["all", "row", "col"]
@@ -30,38 +31,28 @@ def plot_force(
     posterior: Posterior, trials: Sequence[int] | None = None, title: str = "Interaction force"
 ) -> Figure:
     """Measured force and the posterior of a new measurement with its 90 % band, an axis a row, a trial a column."""
-    chosen = _chosen(posterior, trials)
-    figure, grid = _grid(len(posterior.axes), len(chosen), sharex="col", sharey="row")
     marginal = posterior[Latent.FORCE]
-    for column, index in enumerate(chosen):
-        trial, rows = posterior.log.trials[index], posterior.trial_slice(index)
-        for a, axis in enumerate(posterior.axes):
-            ax = grid[a][column]
-            _band(ax, trial.time, marginal, rows, a, "new measurement")
-            if trial.force is not None:
-                ax.plot(trial.time, trial.force[:, a], ".", ms=2.5, color=MEASURED, label="measured")
-            _label(ax, column, a, len(posterior.axes), f"force {axis} [N]", "time [s]")
-        grid[0][column].set_title(f"trial {trial.name}", fontsize=9)
-    return _finished(figure, grid, title)
+
+    def draw(ax: Axes, trial: PreparedTrial, rows: slice, a: int) -> None:
+        _band(ax, trial.time, marginal, rows, a, "new measurement")
+        if trial.force is not None:
+            ax.plot(trial.time, trial.force[:, a], ".", ms=2.5, color=MEASURED, label="measured")
+
+    return _over_time(posterior, trials, draw, "force {axis} [N]", title)
 
 
 def plot_desired_trajectory(posterior: Posterior, trials: Sequence[int] | None = None) -> Figure:
     """Hand and desired position with its 90 % band, an axis a row, a trial a column."""
-    chosen = _chosen(posterior, trials)
-    figure, grid = _grid(len(posterior.axes), len(chosen), sharex="col", sharey="row")
     marginal = posterior[Latent.DESIRED_POSITION]
-    for column, index in enumerate(chosen):
-        trial, rows = posterior.log.trials[index], posterior.trial_slice(index)
-        for a, axis in enumerate(posterior.axes):
-            ax = grid[a][column]
-            _band(ax, trial.time, marginal, rows, a, "desired")
-            ax.plot(trial.time, trial.position[:, a], color=MEASURED, lw=1.0, label="hand")
-            truth = trial.truth.get(f"desired_position_{axis}")
-            if truth is not None:
-                ax.plot(trial.time, truth, "--", color=TRUTH, lw=1.0, label="true desired")
-            _label(ax, column, a, len(posterior.axes), f"position {axis} [m]", "time [s]")
-        grid[0][column].set_title(f"trial {trial.name}", fontsize=9)
-    return _finished(figure, grid, "Desired and actual trajectory")
+
+    def draw(ax: Axes, trial: PreparedTrial, rows: slice, a: int) -> None:
+        _band(ax, trial.time, marginal, rows, a, "desired")
+        ax.plot(trial.time, trial.position[:, a], color=MEASURED, lw=1.0, label="hand")
+        truth = trial.truth.get(f"desired_position_{posterior.axes[a]}")
+        if truth is not None:
+            ax.plot(trial.time, truth, "--", color=TRUTH, lw=1.0, label="true desired")
+
+    return _over_time(posterior, trials, draw, "position {axis} [m]", "Desired and actual trajectory")
 
 
 def plot_impedance(posterior: Posterior, verdicts: Iterable[Verdict], trial: int = 0) -> Figure:
@@ -120,6 +111,25 @@ def save_figure(figure: Figure, path: Path) -> None:
     """
     with whole_file(path) as temporary:
         figure.savefig(temporary, dpi=130)
+
+
+def _over_time(
+    posterior: Posterior,
+    trials: Sequence[int] | None,
+    draw: Callable[[Axes, PreparedTrial, slice, int], None],
+    ylabel: str,
+    title: str,
+) -> Figure:
+    """Panels over time, an axis a row and a trial a column, each filled by `draw`."""
+    chosen = _chosen(posterior, trials)
+    figure, grid = _grid(len(posterior.axes), len(chosen), sharex="col", sharey="row")
+    for column, index in enumerate(chosen):
+        trial, rows = posterior.log.trials[index], posterior.trial_slice(index)
+        for a, axis in enumerate(posterior.axes):
+            draw(grid[a][column], trial, rows, a)
+            _label(grid[a][column], column, a, len(posterior.axes), ylabel.format(axis=axis), "time [s]")
+        grid[0][column].set_title(f"trial {trial.name}", fontsize=9)
+    return _finished(figure, grid, title)
 
 
 def _chosen(posterior: Posterior, trials: Sequence[int] | None) -> list[int]:

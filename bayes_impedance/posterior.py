@@ -11,7 +11,8 @@ where ē = 0 (the equilibrium prior) the posterior of an impedance keeps the who
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -24,7 +25,7 @@ from bayes_impedance.engines.dense import Factor
 from bayes_impedance.features import Features
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, TRAJECTORY_ORDER, InteractionKernel, Latent
 from bayes_impedance.preprocessing import PreparedLog
-from bayes_impedance.priors import ForceModel
+from bayes_impedance.priors import Entry, ForceModel
 from bayes_impedance.training import observations
 
 Array = NDArray[np.float64]
@@ -179,10 +180,10 @@ class _Conditioner:
     def __init__(self, model: ForceModel, given: Features, jitter: float) -> None:
         self.model, self.given = model, given
         self.factor = Factor(model.kernel, observations(model, given), jitter)
-        self.levels = _levels(model, given.inputs)
-        if self.levels is not None:
-            loading, variance = self.levels
-            self.white_loading = self.factor.whiten(loading)
+        variance = _level_variance(model)
+        self.has_levels = variance is not None
+        if variance is not None:
+            self.white_loading = self.factor.whiten(_level_loading(model, given.inputs, Latent.FORCE))
             gram = self.white_loading.mT @ self.white_loading
             root = variance.sqrt()
             scaled = root.unsqueeze(-1) * gram * root.unsqueeze(-2)
@@ -201,31 +202,26 @@ class _Conditioner:
     def _chunk(self, target: Features, latent: Latent) -> Moments:
         cross = _cross_covariance(self.model, self.given.inputs, target.inputs, latent)
         white = self.factor.whiten(cross)
-        alpha = self.factor.alpha.unsqueeze(-1)
-        if self.given.valid is not None:
-            alpha = alpha * self.given.valid.unsqueeze(-1)
-        prior_location, prior_variance = _prior(self.model, target, latent)
-        location = prior_location + (cross.mT @ alpha).squeeze(-1)
+        prior = _prior(self.model, target, latent)
+        # On padding α is zero.
+        location = prior.location + (cross.mT @ self.factor.alpha.unsqueeze(-1)).squeeze(-1)
         # Rounding can push the variance of a fully determined variable just below zero.
-        variance = (_own_variance(self.model, target, latent) - white.square().sum(-2)).clamp_min(0.0)
-        if self.levels is not None:
-            loading = _level_loading(self.model, target.inputs, latent) - white.mT @ self.white_loading
+        variance = (prior.own_variance - white.square().sum(-2)).clamp_min(0.0)
+        if self.has_levels:
+            loading = prior.loading - white.mT @ self.white_loading
             variance = variance + ((loading @ self.level_covariance) * loading).sum(-1)
         if latent is Latent.FORCE:
             variance = variance + self.model.noise_variance
-        shown = _hyperprior_location(self.model, prior_location, latent)
-        return location, variance, shown.expand_as(location), prior_variance.expand_as(location)
+        return location, variance, prior.shown.expand_as(location), prior.variance.expand_as(location)
 
 
 def _prior_only(model: ForceModel, target: Features, latents: Sequence[Latent]) -> dict[Latent, Moments]:
     result = {}
+    shape = target.inputs.shape[:-1]
     for latent in latents:
-        location, variance = _prior(model, target, latent)
-        shown = _hyperprior_location(model, location, latent)
-        shape = target.inputs.shape[:-1]
-        result[latent] = (
-            location.expand(shape), variance.expand(shape), shown.expand(shape), variance.expand(shape),
-        )  # fmt: skip
+        prior = _prior(model, target, latent)
+        location, variance = prior.location.expand(shape), prior.variance.expand(shape)
+        result[latent] = (location, variance, prior.shown.expand(shape), variance)
     return result
 
 
@@ -242,56 +238,70 @@ def _own_variance(model: ForceModel, target: Features, latent: Latent) -> Tensor
     return model.kernel(target.inputs, diag=True)
 
 
-def _prior(model: ForceModel, target: Features, latent: Latent) -> tuple[Tensor, Tensor]:
-    """Prior location and variance, with the variance of the levels and, for force, of the noise."""
-    variance = _own_variance(model, target, latent)
-    levels = _levels(model, target.inputs)
-    if levels is not None:
-        loading = _level_loading(model, target.inputs, latent)
-        variance = variance + (loading.square() * levels[1].unsqueeze(-2)).sum(-1)
+class _Prior(NamedTuple):
+    """Prior of a latent at some samples, `(axes, groups, m)` each or what broadcasts to it.
+
+    `location` at the fitted levels, `shown` before training; `own_variance` at known levels and without noise,
+    `variance` with both; `loading` is the derivative of the location by the levels' offsets b_j.
+    """
+
+    location: Tensor
+    shown: Tensor
+    own_variance: Tensor
+    variance: Tensor
+    loading: Tensor
+
+
+def _prior(model: ForceModel, target: Features, latent: Latent) -> _Prior:
+    own = _own_variance(model, target, latent)
+    loading = _level_loading(model, target.inputs, latent)
+    levels = _level_variance(model)
+    variance = own if levels is None else own + (loading.square() * levels.unsqueeze(-2)).sum(-1)
     if latent is Latent.FORCE:
-        return model.prior_mean(target.inputs), variance + model.noise_variance
+        location = model.prior_mean(target.inputs)
+        return _Prior(location, location, own, variance + model.noise_variance, loading)
     if latent is Latent.RESIDUAL_FORCE:
-        return torch.zeros_like(variance), variance
+        location = torch.zeros_like(own)
+        return _Prior(location, location, own, variance, loading)
     if latent in TRAJECTORY_ORDER:
-        return target.trajectory_mean[..., TRAJECTORY_ORDER[latent]], variance
+        location = target.trajectory_mean[..., TRAJECTORY_ORDER[latent]]
+        return _Prior(location, location, own, variance, loading)
     process = model.kernel.impedance.processes[IMPEDANCE_ORDER[latent]]
-    level = process.level[..., 0]
-    return (level if process.law == "gaussian" else level.log()), variance
+    level, median = process.level[..., 0], _level_entry(model, latent).medians
+    if process.law == "log_gaussian":
+        level, median = level.log(), median.log()
+    return _Prior(level, median, own, variance, loading)
 
 
-def _hyperprior_location(model: ForceModel, location: Tensor, latent: Latent) -> Tensor:
-    """Where the prior of a latent lay before training: for impedance at the median of its level's hyperprior."""
-    if latent not in IMPEDANCE_ORDER:
-        return location
-    median = next(entry.medians for entry in model.entries if entry.name == f"{latent.value}.level")
-    process = model.kernel.impedance.processes[IMPEDANCE_ORDER[latent]]
-    return median if process.law == "gaussian" else median.log()
+def _level_entry(model: ForceModel, latent: Latent) -> Entry:
+    return next(entry for entry in model.entries if entry.name == f"{latent.value}.level")
 
 
-def _levels(model: ForceModel, inputs: Tensor) -> tuple[Tensor, Tensor] | None:
-    """∂E[u]/∂b_j `(axes, groups, n, 3)` and Var[b_j] `(axes, 1, 3)`; None for a naive GP."""
+def _level_variance(model: ForceModel) -> Tensor | None:
+    """Var[b_j], `(axes, 1, 3)`; None for a naive GP."""
     if not isinstance(model.kernel, InteractionKernel):
         return None
     variances = []
-    entries = {entry.name: entry for entry in model.entries}
     for latent, order in IMPEDANCE_ORDER.items():
         process = model.kernel.impedance.processes[order]
-        spec = entries[f"{latent.value}.level"].specs[0]
+        spec = _level_entry(model, latent).specs[0]
         log_sd = 0.0 if spec.fixed else spec.log_sd
-        scale = process.level[..., 0] if process.law == "gaussian" else torch.ones_like(process.level[..., 0])
+        level = process.level[..., 0]
+        scale = level if process.law == "gaussian" else torch.ones_like(level)
         variances.append((scale * log_sd).square())
-    return _level_loading(model, inputs, Latent.FORCE), torch.cat(variances, dim=-1)
+    return torch.cat(variances, dim=-1)
 
 
 def _level_loading(model: ForceModel, inputs: Tensor, latent: Latent) -> Tensor:
-    """Derivative of the latent's prior location by each b_j, `(axes, groups, n, 3)`."""
-    impedance = model.kernel.impedance
+    """Derivative of the latent's prior location by each b_j, `(axes, groups, n, 3)`; zero for a naive GP."""
     loading = inputs.new_zeros(*inputs.shape[:-1], len(IMPEDANCE_ORDER))
     if latent in IMPEDANCE_ORDER:
         loading[..., IMPEDANCE_ORDER[latent]] = 1.0
+    if latent is not Latent.FORCE or not isinstance(model.kernel, InteractionKernel):
+        return loading
+    impedance = model.kernel.impedance
     errors = impedance.layout.errors(inputs, impedance.order)
-    if latent is Latent.FORCE and errors is not None:
+    if errors is not None:
         for j, process in enumerate(impedance.processes):
             loading[..., j] = (errors[j] * process.sensitivity(inputs)).squeeze(-1)
     return loading
@@ -319,7 +329,8 @@ def _marginal(
 
 def _select_groups(features: Features, groups: Sequence[str]) -> Features:
     index = [features.groups.index(group) for group in groups]
-    return Features(
+    return replace(
+        features,
         groups=tuple(groups),
         inputs=features.inputs[:, index],
         force=None if features.force is None else features.force[:, index],
@@ -330,11 +341,15 @@ def _select_groups(features: Features, groups: Sequence[str]) -> Features:
 
 
 def _chunks(features: Features) -> list[Features]:
-    n = features.inputs.shape[2]
+    starts = range(0, features.inputs.shape[2], CHUNK)
+    pieces = [slice(start, start + CHUNK) for start in starts]
     return [
-        Features(
-            features.groups, features.inputs[:, :, s : s + CHUNK], None,
-            features.trajectory_mean[:, :, s : s + CHUNK], None, features.rows,
+        replace(
+            features,
+            inputs=features.inputs[:, :, piece],
+            force=None,
+            trajectory_mean=features.trajectory_mean[:, :, piece],
+            valid=None,
         )
-        for s in range(0, n, CHUNK)
-    ]  # fmt: skip
+        for piece in pieces
+    ]

@@ -27,11 +27,12 @@ from bayes_impedance.log import (
     Integers,
     InteractionLog,
     Trial,
-    chosen_trials,
-    digest,
+    TrialSet,
     read_only,
-    trial_arrays,
 )
+
+#: A channel and its first two derivatives.
+Orders = tuple[Array, Array, Array]
 
 #: Steps that differ from the median by more than this share of it make a trial unevenly sampled.
 UNEVEN = 0.01
@@ -92,47 +93,17 @@ _ARRAYS = tuple(entry.name for entry in fields(PreparedTrial) if entry.name not 
 _REQUIRED = ("time", "position", "velocity", "acceleration", "jerk", "repetition")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PreparedLog:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class PreparedLog(TrialSet[PreparedTrial]):
     """Prepared trials that share their axes."""
 
     axes: tuple[str, ...]
     trials: tuple[PreparedTrial, ...]
 
-    @property
-    def groups(self) -> tuple[str, ...]:
-        """Groups in order of appearance."""
-        return tuple(dict.fromkeys(trial.group for trial in self.trials))
-
-    @property
-    def n_samples(self) -> int:
-        """Number of samples of all trials together."""
-        return sum(trial.n_samples for trial in self.trials)
-
-    def select(self, which: Callable[[PreparedTrial], bool] | Sequence[int]) -> PreparedLog:
-        """Log of the trials that fulfil a predicate or have these indices, in the order given.
-
-        Raises LogError when that leaves no trial or an index does not exist.
-        """
-        return PreparedLog(self.axes, chosen_trials(self.trials, which))
-
-    def fingerprint(self) -> str:
-        """SHA-256 (hex) of axes, names, groups and arrays; where the files lie does not matter."""
-        names = [[trial.name, trial.group] for trial in self.trials]
-        return digest({"axes": self.axes, "trials": names}, self.arrays())
-
     def header(self) -> dict[str, Any]:
         """What `arrays` leaves out, as plain JSON: axes and, for each trial, name, group and source."""
         trials = [{name: getattr(trial, name) for name in _NAMES} for trial in self.trials]
         return {"axes": list(self.axes), "trials": trials}
-
-    def arrays(self) -> dict[str, npt.NDArray[Any]]:
-        """Every array by name, such as `trials.3.position` or `trials.3.truth.stiffness_xx`."""
-        return {
-            f"trials.{index}.{name}": array
-            for index, trial in enumerate(self.trials)
-            for name, array in trial_arrays(trial).items()
-        }
 
     @classmethod
     def from_arrays(cls, header: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> Self:
@@ -172,10 +143,6 @@ class PreparedLog:
                 "the log anew"
             )
         return cls(axes, tuple(trials))
-
-    def __repr__(self) -> str:
-        """Axes and sizes."""
-        return f"PreparedLog(axes={''.join(self.axes)}, {len(self.trials)} trials, {self.n_samples} samples)"
 
 
 def prepare(log: InteractionLog, config: PreprocessingConfig) -> PreparedLog:
@@ -320,25 +287,45 @@ def _smoothed(trial: Trial, smooth: _SavitzkyGolay) -> PreparedTrial:
         velocity, acceleration, jerk = (smooth(trial.velocity, order) for order in (0, 1, 2))
     if trial.acceleration is not None:
         acceleration, jerk = smooth(trial.acceleration), smooth(trial.acceleration, 1)
+    return _assembled(
+        trial,
+        (smooth(trial.position), velocity, acceleration, jerk),
+        value=smooth,
+        orders=lambda values: (smooth(values), smooth(values, 1), smooth(values, 2)),
+        phase_orders=lambda phase, part: _smooth_phase(trial, phase, part, smooth),
+    )
+
+
+def _assembled(
+    trial: Trial,
+    motion: tuple[Array, Array, Array, Array],
+    value: Callable[[Array], Array],
+    orders: Callable[[Array], Orders],
+    phase_orders: Callable[[Array, slice], Orders],
+) -> PreparedTrial:
+    """Prepared trial of position, velocity, acceleration and jerk, its other channels by the same rule.
+
+    `value` gives a channel as the model sees it, `orders` it and two derivatives, `phase_orders` the same of phase
+    within a repetition.
+    """
     optional: dict[str, Any] = {}
     for name in ("force", "perturbation"):
         values = getattr(trial, name)
-        optional[name] = None if values is None else smooth(values)
+        optional[name] = None if values is None else value(values)
     if trial.reference is not None:
-        optional |= _with_derivatives(
-            "reference", tuple(smooth(trial.reference, order) for order in range(3))
-        )
+        optional |= _with_derivatives("reference", orders(trial.reference))
     if trial.phase is not None:
-        parts = [_smooth_phase(trial, trial.phase, part, smooth) for part in _repetitions(trial)]
+        parts = [phase_orders(trial.phase, part) for part in _repetitions(trial)]
         optional |= _with_derivatives(
             "phase", tuple(np.concatenate(order) for order in zip(*parts, strict=True))
         )
+    position, velocity, acceleration, jerk = motion
     return PreparedTrial(
         name=trial.name,
         group=trial.group,
         source=trial.source,
         time=trial.time,
-        position=smooth(trial.position),
+        position=position,
         velocity=velocity,
         acceleration=acceleration,
         jerk=jerk,
@@ -352,9 +339,7 @@ def _with_derivatives(name: str, orders: Sequence[Array]) -> dict[str, Array]:
     return dict(zip((name, f"{name}_velocity", f"{name}_acceleration"), orders, strict=True))
 
 
-def _smooth_phase(
-    trial: Trial, phase: Array, part: slice, smooth: _SavitzkyGolay
-) -> tuple[Array, Array, Array]:
+def _smooth_phase(trial: Trial, phase: Array, part: slice, smooth: _SavitzkyGolay) -> Orders:
     """Phase [1] and its two derivatives [1/s, 1/s²] within one repetition, since phase jumps between two."""
     time, values = trial.time[part], phase[part]
     _check_phase_length(len(time), float(time[0]), trial)
@@ -384,35 +369,22 @@ def _as_logged(trial: Trial) -> PreparedTrial:
             f"{_at(trial)}: expected velocity and acceleration in a log that is not smoothed, found no "
             f"{lacking}; set preprocessing.smoother"
         )
-    optional: dict[str, Any] = {}
-    if trial.reference is not None:
-        optional |= _with_derivatives("reference", _gradients(trial.reference, trial.time))
-    if trial.phase is not None:
-        parts = []
-        for part in _repetitions(trial):
-            _check_phase_length(part.stop - part.start, float(trial.time[part.start]), trial)
-            parts.append(_gradients(trial.phase[part], trial.time[part]))
-        optional |= _with_derivatives(
-            "phase", tuple(np.concatenate(order) for order in zip(*parts, strict=True))
-        )
-    return PreparedTrial(
-        name=trial.name,
-        group=trial.group,
-        source=trial.source,
-        time=trial.time,
-        position=trial.position,
-        velocity=trial.velocity,
-        acceleration=trial.acceleration,
-        jerk=np.gradient(trial.acceleration, trial.time, axis=0),
-        repetition=trial.repetition,
-        force=trial.force,
-        perturbation=trial.perturbation,
-        truth=trial.truth,
-        **optional,
+
+    def phase_orders(phase: Array, part: slice) -> Orders:
+        _check_phase_length(part.stop - part.start, float(trial.time[part.start]), trial)
+        return _gradients(phase[part], trial.time[part])
+
+    jerk = np.gradient(trial.acceleration, trial.time, axis=0)
+    return _assembled(
+        trial,
+        (trial.position, trial.velocity, trial.acceleration, jerk),
+        value=lambda values: values,
+        orders=lambda values: _gradients(values, trial.time),
+        phase_orders=phase_orders,
     )
 
 
-def _gradients(values: Array, time: Array) -> tuple[Array, Array, Array]:
+def _gradients(values: Array, time: Array) -> Orders:
     first = np.gradient(values, time, axis=0)
     return values, first, np.gradient(first, time, axis=0)
 

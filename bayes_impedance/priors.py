@@ -52,14 +52,13 @@ class LogScalePrior(NormalPrior):
 
 @dataclass(frozen=True)
 class Entry:
-    """One hyperparameter of a force model: where it lives, its unit and hyperprior.
+    """One hyperparameter of a force model: where it lives, its units and hyperprior.
 
-    `specs[c]` is the hyperprior of component c of the last dimension, `labels[c]` its name; `power` maps
-    the module's value to the one that users see (σ_r from a variance).
+    `specs[c]` is the hyperprior of component c of the last dimension, `labels[c]` its name, `units[c]` its unit;
+    `power` maps the module's value to the one that users see (σ_r from a variance).
     """
 
     name: str
-    unit: str
     labels: tuple[str, ...]
     specs: tuple[Hyperparameter, ...]
     raw: torch.nn.Parameter
@@ -289,7 +288,7 @@ def _length_scale_specs(
 
 def _entry(name: str, unit: str, module: Any, attribute: str, spec: Hyperparameter) -> Entry:
     raw, constraint = getattr(module, f"raw_{attribute}"), getattr(module, f"raw_{attribute}_constraint")
-    return Entry(name, unit, ("",), (spec,), raw, constraint, (unit,))
+    return Entry(name, ("",), (spec,), raw, constraint, (unit,))
 
 
 def _length_scales(
@@ -300,7 +299,7 @@ def _length_scales(
     labels = tuple(features.labels(components))
     units = tuple(UNITS[component] for component in components for _ in features.labels([component]))
     return Entry(
-        f"{name}.length_scale", units[0], labels, specs,
+        f"{name}.length_scale", labels, specs,
         module.raw_lengthscale, module.raw_lengthscale_constraint, units,
     )  # fmt: skip
 
@@ -330,6 +329,4 @@ def _residual_entries(
 def _noise_entry(force_model: ForceModel, config: Config) -> Entry:
     noise = force_model.likelihood.noise_covar
     spec = config.model.noise_sd
-    return Entry(
-        "noise_sd", "N", ("",), (spec,), noise.raw_noise, noise.raw_noise_constraint, ("N",), power=0.5
-    )
+    return Entry("noise_sd", ("",), (spec,), noise.raw_noise, noise.raw_noise_constraint, ("N",), power=0.5)

@@ -27,7 +27,6 @@ class TrajectoryMean:
     """μ_xd as learned from training trials; call `derivatives` for any trial of a known group."""
 
     prior: DesiredTrajectoryPrior
-    axes: tuple[str, ...]
     averages: Mapping[str, BSpline]
     constants: Mapping[str, Array]
 
@@ -47,7 +46,7 @@ class TrajectoryMean:
                 averages[group] = _average(trials, prior.average_knots)
             elif prior.mean == "constant":
                 constants[group] = _constant(prior, log.axes, trials)
-        return cls(prior, log.axes, averages, constants)
+        return cls(prior, averages, constants)
 
     def derivatives(self, trial: PreparedTrial) -> Array:
         """μ_xd, dμ_xd/dt, d²μ_xd/dt² at each sample, `(3, n, axes)` [m, m/s, m/s²].
