@@ -87,10 +87,12 @@ def train(
     config: TrainingConfig,
     jitter: float,
     progress: Progress | None = None,
+    warm: bool = False,
 ) -> TrainingReport:
     """Set the hyperparameters of `model` to their MAP estimate; deterministic under `config.seed`.
 
-    Interrupting (Ctrl-C) keeps the best found so far.
+    Restart 0 starts at the hyperprior medians or, when `warm`, where `model` stands; the others at draws from the
+    hyperprior. Interrupting (Ctrl-C) keeps the best found so far.
 
     Raises:
         NotPositiveDefiniteError: no restart found a covariance that factorises.
@@ -101,7 +103,7 @@ def train(
     interrupted = False
     failure: NotPositiveDefiniteError | None = None
     for restart in range(config.restarts):
-        start = search.start(generator if restart else None)
+        start = search.here() if warm and not restart else search.start(generator if restart else None)
         search.begin(restart, progress)
         clock = time.perf_counter()
         try:
@@ -212,6 +214,13 @@ class _Search:
             raw = torch.stack([entry.inverse(row)[0].reshape(-1) for row in values])
             columns.append(raw.numpy())
         point = np.concatenate(columns, axis=1)[:, self.free].reshape(-1) if columns else np.zeros(0)
+        return self._inside(point)
+
+    def here(self) -> Array:
+        """Where the model stands, inside the bounds."""
+        return self._inside(self.pack().reshape(-1))
+
+    def _inside(self, point: Array) -> Array:
         lower, upper = np.array(self.bounds).reshape(-1, 2).T
         return np.asarray(np.clip(point, lower, upper))
 
