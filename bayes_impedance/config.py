@@ -13,7 +13,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
 
+import numpy as np
 import yaml
+from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from bayes_impedance.errors import ConfigurationError
@@ -51,15 +53,23 @@ class Hyperparameter(Section):
 
 
 def _number_means_fixed(value: Any) -> Any:
+    number = _as_number(value)
+    return value if number is None else {"median": number, "fixed": True}
+
+
+def _number_means_every_axis(value: Any) -> Any:
+    number = _as_number(value)
+    return value if number is None else dict.fromkeys(get_args(Axis), number)
+
+
+def _as_number(value: Any) -> float | None:
     if isinstance(value, str):
         # YAML 1.1 reads 1e-3, without a point, as text.
         try:
-            value = float(value)
+            return float(value)
         except ValueError:
-            return value
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
-        return {"median": value, "fixed": True}
-    return value
+            return None
+    return value if isinstance(value, (int, float)) and not isinstance(value, bool) else None
 
 
 Scale = Annotated[Hyperparameter, BeforeValidator(_number_means_fixed)]
@@ -305,6 +315,61 @@ class SharedConfig(Section):
     residual: bool = False
 
 
+PerAxis = BeforeValidator(_number_means_every_axis)
+
+
+class DeviceConfig(Section):
+    """An admittance-controlled robot: virtual `mass` M_r [kg] and `damping` D_r [Ns/m] of M_r ẍ + D_r ẋ = u + p.
+
+    One number, or one for each axis. `acceleration: law` takes ẍ from this law and the recorded force u and
+    perturbation p, `measured` from the motion.
+    """
+
+    mass: Annotated[dict[Axis, Annotated[float, Field(gt=0)]], PerAxis]
+    damping: Annotated[dict[Axis, Annotated[float, Field(ge=0)]] | None, PerAxis] = None
+    acceleration: Literal["measured", "law"] = "measured"
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.acceleration == "law" and self.damping is None:
+            raise ValueError(
+                "acceleration: the law M_r ẍ + D_r ẋ = u + p needs damping, got none; add it (0 is allowed), or set "
+                "acceleration: measured"
+            )
+        return self
+
+    def masses(self, axes: Iterable[str]) -> NDArray[np.float64]:
+        """M_r of `axes`, `(axes,)` [kg].
+
+        Raises:
+            ConfigurationError: an axis has none.
+        """
+        return _of_axes("device.mass", "mass [kg]", self.mass, axes)
+
+    def dampings(self, axes: Iterable[str]) -> NDArray[np.float64] | None:
+        """D_r of `axes`, `(axes,)` [Ns/m]; None where the configuration does not say.
+
+        Raises:
+            ConfigurationError: an axis has none while another has.
+        """
+        return (
+            None if self.damping is None else _of_axes("device.damping", "damping [Ns/m]", self.damping, axes)
+        )
+
+
+def _of_axes(
+    key: str, quantity: str, values: Mapping[Any, float], axes: Iterable[str]
+) -> NDArray[np.float64]:
+    listed = list(axes)
+    missing = [axis for axis in listed if axis not in values]
+    if missing:
+        raise ConfigurationError(
+            f"{key}: expected a {quantity} for each of {', '.join(listed)}, found none for {', '.join(missing)}; add "
+            "it, or give one number for all"
+        )
+    return np.array([values[axis] for axis in listed])
+
+
 # --- inference -----------------------------------------------------------------------------------
 
 
@@ -338,6 +403,7 @@ class Config(Section):
     preprocessing: PreprocessingConfig = PreprocessingConfig()
     model: ModelConfig = ModelConfig()
     shared: SharedConfig = SharedConfig()
+    device: DeviceConfig | None = None
     engine: EngineConfig = EngineConfig()
     training: TrainingConfig = TrainingConfig()
     baseline: BaselineConfig = BaselineConfig()
@@ -448,6 +514,8 @@ def _explain(error: ValidationError) -> str:
     if problem["type"] == "model_type":
         number = "a number or " if problem["ctx"]["class_name"] == Hyperparameter.__name__ else ""
         return f"{key}: expected {number}a mapping of keys to values, got {problem['input']!r}"
+    if problem["type"] == "dict_type":
+        return f"{key}: expected a mapping of axes to numbers, such as {{x: 1.0, y: 2.0}}, got {problem['input']!r}"
     message = re.sub(r"^Value error, ", "", problem["msg"])
     message = message[:1].lower() + message[1:]
     if problem["type"] == "value_error":

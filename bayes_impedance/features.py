@@ -29,7 +29,8 @@ class Features:
     `inputs` `(axes, groups, n, D)`; `force` `(axes, groups, n)` [N], None where the log has none;
     `trajectory_mean` `(axes, groups, n, 3)`: μ_xd and its derivatives [m, m/s, m/s²]; `valid`
     `(groups, n)` is False on padding, None where nothing is padded; `rows[g]` lists (trial, sample) of
-    each valid row.
+    each valid row; `device_mass` `(axes, 1)`: M_r of a device that answers force by acceleration [kg], None where
+    none does or acceleration does not enter the force.
     """
 
     groups: tuple[str, ...]
@@ -38,6 +39,7 @@ class Features:
     trajectory_mean: Tensor
     valid: Tensor | None
     rows: tuple[NDArray[np.int64], ...]
+    device_mass: Tensor | None = None
 
 
 class FeatureMap:
@@ -76,6 +78,9 @@ class FeatureMap:
         for component in self.xi:
             take(f"xi.{component}", self._size(component))
         self.width = width
+        # Around the hand itself ē_2 = 0: no acceleration enters the force (docs/model.md §6).
+        answers = config.device is not None and bool(self.layout.error)
+        self.device = config.device if answers else None
 
     def active_dims(self, components: Sequence[Component]) -> tuple[int, ...]:
         """Input columns of some components of ξ."""
@@ -123,7 +128,11 @@ class FeatureMap:
             trajectory_mean=torch.from_numpy(means),
             valid=None if valid.all() else torch.from_numpy(valid),
             rows=tuple(rows),
+            device_mass=self._device_mass(),
         )
+
+    def _device_mass(self) -> Tensor | None:
+        return None if self.device is None else torch.from_numpy(self.device.masses(self.axes)).unsqueeze(-1)
 
     def _trial(self, trial: PreparedTrial, mean: TrajectoryMean, label: int) -> tuple[Array, Array]:
         n, a = len(trial.time), len(self.axes)

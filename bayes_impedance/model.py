@@ -11,7 +11,9 @@ from typing import Literal
 import torch
 
 from bayes_impedance.config import Config, load_config
-from bayes_impedance.engines.dense import Observations, check_capacity, log_marginal_likelihood
+from bayes_impedance.device import follow_law
+from bayes_impedance.engines.closed_loop import log_likelihood
+from bayes_impedance.engines.dense import Observations, check_capacity
 from bayes_impedance.engines.pointwise import PointPredictor
 from bayes_impedance.errors import ConfigurationError, LogError
 from bayes_impedance.features import FeatureMap, check_combination, count_repetitions, label_trials, trial_key
@@ -93,6 +95,8 @@ class ImpedanceModel:
             LogError, ConfigurationError: the log cannot serve this configuration.
         """
         prepared = log if isinstance(log, PreparedLog) else prepare(log, self.config.preprocessing)
+        if self.config.device is not None:
+            prepared = follow_law(prepared, self.config.device)
         check_combination(self.config, prepared)
         if self._fit is not None and prepared.axes != self._fit.log.axes:
             raise LogError(
@@ -172,7 +176,8 @@ class ImpedanceModel:
         with torch.no_grad():
             given = observations(model, features)
             one = Observations(given.inputs[a, g, :n], given.residual[a, g, :n], given.noise_variance[a, 0])
-        return PointPredictor(model.kernel[a, 0], one, self.config.engine.jitter)
+        device_mass = None if features.device_mass is None else features.device_mass[a, 0]
+        return PointPredictor(model.kernel[a, 0], one, self.config.engine.jitter, device_mass)
 
     def log_marginal_likelihood(self, log: InteractionLog | PreparedLog) -> dict[str, float]:
         """log p(force of `log`) at the model's hyperparameters, by axis, summed over groups [nats].
@@ -188,8 +193,8 @@ class ImpedanceModel:
             raise LogError("expected a log with force, found none; name log.columns.force")
         model = self._force_model(feature_map)
         with torch.no_grad():
-            value = log_marginal_likelihood(
-                model.kernel, observations(model, features), self.config.engine.jitter
+            value = log_likelihood(
+                model.kernel, observations(model, features), features.device_mass, self.config.engine.jitter
             ).sum(-1)
         return dict(zip(prepared.axes, value.tolist(), strict=True))
 

@@ -17,7 +17,8 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from bayes_impedance.config import TrainingConfig
-from bayes_impedance.engines.dense import Observations, log_marginal_likelihood
+from bayes_impedance.engines.closed_loop import log_likelihood
+from bayes_impedance.engines.dense import Observations
 from bayes_impedance.errors import NotPositiveDefiniteError
 from bayes_impedance.features import Features
 from bayes_impedance.priors import Entry, ForceModel
@@ -77,7 +78,9 @@ def observations(model: ForceModel, features: Features) -> Observations:
 
 def objective(model: ForceModel, features: Features, jitter: float) -> tuple[Tensor, Tensor]:
     """Log posterior density of the hyperparameters and log marginal likelihood, `(axes,)` each [nats]."""
-    likelihood = log_marginal_likelihood(model.kernel, observations(model, features), jitter).sum(-1)
+    likelihood = log_likelihood(
+        model.kernel, observations(model, features), features.device_mass, jitter
+    ).sum(-1)
     return likelihood + model.log_prior(), likelihood
 
 

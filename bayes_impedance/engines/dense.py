@@ -36,6 +36,12 @@ class Observations:
     noise_variance: Tensor
     valid: Tensor | None = None
 
+    @property
+    def count(self) -> Tensor:
+        """Samples of each batch entry, padding left out."""
+        n = self.residual.shape[-1]
+        return self.residual.new_tensor(n) if self.valid is None else self.valid.sum(-1).to(self.residual)
+
 
 def log_marginal_likelihood(kernel: Kernel, observations: Observations, jitter: float = 0.0) -> Tensor:
     """log N(u; E[u], K + σ_r² I), `(*batch,)` [nats], differentiable in kernel, residual and noise.
@@ -45,10 +51,30 @@ def log_marginal_likelihood(kernel: Kernel, observations: Observations, jitter: 
     Raises:
         NotPositiveDefiniteError: no Cholesky factor at this jitter.
     """
+    forms, log_det = quadratic_forms(kernel, observations, observations.residual.unsqueeze(-1), jitter)
+    return log_density(forms[..., 0, 0], log_det, observations)
+
+
+def quadratic_forms(
+    kernel: Kernel, observations: Observations, columns: Tensor, jitter: float = 0.0
+) -> tuple[Tensor, Tensor]:
+    """Bᵀ (K + σ_r² I)⁻¹ B and log det (K + σ_r² I) for `columns` B `(*batch, n, c)`: `(*batch, c, c)`, `(*batch,)`.
+
+    Differentiable in kernel, noise and columns; `jitter` as in `log_marginal_likelihood`.
+
+    Raises:
+        NotPositiveDefiniteError: no Cholesky factor at this jitter.
+    """
     parameters = [p for p in kernel.parameters() if p.requires_grad]
-    return _LogMarginalLikelihood.apply(
-        kernel, observations, jitter, observations.residual, observations.noise_variance, *parameters
+    forms, log_det = _QuadraticForms.apply(
+        kernel, observations, jitter, columns, observations.noise_variance, *parameters
     )
+    return forms, log_det
+
+
+def log_density(form: Tensor, log_det: Tensor, observations: Observations) -> Tensor:
+    """log N(u; E[u], K + σ_r² I) from `form` rᵀ(K + σ_r² I)⁻¹r and the log determinant, `(*batch,)` [nats]."""
+    return -0.5 * (form + log_det + observations.count * math.log(2.0 * math.pi))
 
 
 class Factor:
@@ -67,9 +93,7 @@ class Factor:
 
     def whiten(self, columns: Tensor) -> Tensor:
         """L⁻¹ `columns`, `(*batch, n, m)`; products of two such are inner products in (K + σ_r² I)⁻¹."""
-        if self.valid is not None:
-            columns = columns * self.valid.unsqueeze(-1)
-        return torch.linalg.solve_triangular(self.cholesky, columns, upper=False)
+        return torch.linalg.solve_triangular(self.cholesky, _masked_rows(columns, self.valid), upper=False)
 
 
 def check_capacity(n: int, limit: int, where: str) -> None:
@@ -89,36 +113,35 @@ def check_capacity(n: int, limit: int, where: str) -> None:
         )
 
 
-class _LogMarginalLikelihood(torch.autograd.Function):
-    """log p and its gradient; the gradient of K is contracted block by block."""
+class _QuadraticForms(torch.autograd.Function):
+    """Bᵀ K⁻¹ B, log det K and their gradients; that of K is contracted block by block."""
 
     @staticmethod
     def forward(
         ctx: Any, kernel: Kernel, observations: Observations, jitter: float,
-        residual: Tensor, noise_variance: Tensor, *parameters: Tensor,
-    ) -> Tensor:  # fmt: skip
-        valid = observations.valid
+        columns: Tensor, noise_variance: Tensor, *parameters: Tensor,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
         cholesky = _cholesky(kernel, observations, jitter)
-        masked = _masked(residual, valid)
-        alpha = torch.cholesky_solve(masked.unsqueeze(-1), cholesky).squeeze(-1)
-        count = residual.shape[-1] if valid is None else valid.sum(-1).to(residual)
+        masked = _masked_rows(columns, observations.valid)
+        solved = torch.cholesky_solve(masked, cholesky)
         log_det = 2.0 * cholesky.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        ctx.kernel, ctx.observations = kernel, observations
-        ctx.save_for_backward(cholesky, alpha)
-        return -0.5 * ((masked * alpha).sum(-1) + log_det + count * math.log(2.0 * math.pi))
+        ctx.kernel, ctx.observations, ctx.shape = kernel, observations, columns.shape
+        ctx.save_for_backward(cholesky, solved)
+        return masked.mT @ solved, log_det
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
+    def backward(ctx: Any, grad_forms: Tensor, grad_log_det: Tensor) -> tuple[Any, ...]:
         kernel, observations = ctx.kernel, ctx.observations
-        cholesky, alpha = ctx.saved_tensors
+        cholesky, solved = ctx.saved_tensors
         valid = observations.valid
-        # ∂ log p/∂K = ½ (α αᵀ − K⁻¹)
-        weight = torch.cholesky_inverse(cholesky).neg_()
-        weight.addcmul_(alpha.unsqueeze(-1), alpha.unsqueeze(-2)).mul_(0.5 * grad[..., None, None])
+        # d(BᵀK⁻¹B) = dBᵀA + AᵀdB − AᵀdK A with A = K⁻¹B, d log det K = tr K⁻¹dK
+        symmetric = grad_forms + grad_forms.mT
+        column_gradient = _sum_to(_masked_rows(solved @ symmetric, valid), ctx.shape)
+        weight = torch.cholesky_inverse(cholesky).mul_(grad_log_det[..., None, None])
+        weight.sub_(0.5 * (solved @ symmetric) @ solved.mT)
         diagonal = weight.diagonal(dim1=-2, dim2=-1)
         noise_gradient = _masked(diagonal, valid).sum(-1, keepdim=True)
         noise_gradient = _sum_to(noise_gradient, observations.noise_variance.shape)
-        residual_gradient = _sum_to(_masked(-alpha, valid) * grad.unsqueeze(-1), observations.residual.shape)
 
         parameters = [p for p in kernel.parameters() if p.requires_grad]
         gradients = [torch.zeros_like(p) for p in parameters]
@@ -134,7 +157,7 @@ class _LogMarginalLikelihood(torch.autograd.Function):
             for total, part in zip(gradients, parts, strict=True):
                 if part is not None:
                     total.add_(part)
-        return (None, None, None, residual_gradient, noise_gradient, *gradients)
+        return (None, None, None, column_gradient, noise_gradient, *gradients)
 
 
 def _cholesky(kernel: Kernel, observations: Observations, jitter: float) -> Tensor:
@@ -173,6 +196,10 @@ def _blocks(inputs: Tensor) -> Iterator[tuple[int, int]]:
 
 def _masked(values: Tensor, valid: Tensor | None) -> Tensor:
     return values if valid is None else values * valid
+
+
+def _masked_rows(columns: Tensor, valid: Tensor | None) -> Tensor:
+    return columns if valid is None else columns * valid.unsqueeze(-1)
 
 
 def _masked_block(block: Tensor, valid: Tensor | None, start: int, stop: int) -> Tensor:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.linalg.blas import dtrsv
 from torch import Tensor
 
+from bayes_impedance.engines.closed_loop import MassEvidence
 from bayes_impedance.engines.dense import Factor, Observations
 from bayes_impedance.kernels.derivative import Forms, Table, combine
 from bayes_impedance.kernels.impedance import InteractionKernel, force_covariance
@@ -34,13 +35,20 @@ class PointPredictor:
         kernel: without batch dimensions; its covariances must be `StationaryKernel`s or sums of them.
         observations: inputs `(n, D)`, residual `(n,)` [N], noise variance `(1,)` [N²].
         jitter: as in `engines.dense`.
+        device_mass: M_r [kg] of a device that answers force, a scalar; None for none.
 
     Raises:
         TypeError: a covariance of another kind.
         NotPositiveDefiniteError: no Cholesky factor at this jitter.
     """
 
-    def __init__(self, kernel: InteractionKernel, observations: Observations, jitter: float = 0.0) -> None:
+    def __init__(
+        self,
+        kernel: InteractionKernel,
+        observations: Observations,
+        jitter: float = 0.0,
+        device_mass: Tensor | None = None,
+    ) -> None:
         factor = Factor(kernel, observations, jitter)
         inputs = observations.inputs.numpy()
         self._alpha = factor.alpha.numpy()
@@ -62,6 +70,11 @@ class PointPredictor:
         self._residual_variance = sum(part.variance for part in residual_parts)
         self._labels = None if self._layout.residual is None else inputs[:, self._layout.residual]
         self._errors = [inputs[:, c] for c in self._layout.error] or None
+        self._mass: tuple[Array, float, float] | None = None
+        if device_mass is not None:
+            evidence = MassEvidence(impedance, factor, observations, device_mass)
+            slope, gain = evidence.jacobian.slope, evidence.gain(evidence.variance)
+            self._mass = evidence.white[:, 0].numpy(), float(slope), float(gain)
 
     def predict(self, x: Array) -> tuple[float, float]:
         """E and Var of a new measurement of force [N, N²] at the inputs `x` `(D,)`, levels taken as known."""
@@ -83,7 +96,13 @@ class PointPredictor:
         mean = cross @ self._alpha
         if errors is not None:
             mean += sum(e * w for e, w in zip(errors, weights, strict=True))
-        return float(mean), float(max(prior - float(white @ white), 0.0) + self._noise)
+        variance = prior - float(white @ white)
+        if self._mass is not None and errors is not None:
+            white_mass, slope, gain = self._mass
+            with_mass = errors[-1] * self._processes[-1].variance - float(white @ white_mass)
+            mean += slope * with_mass
+            variance -= gain * with_mass**2
+        return float(mean), max(variance, 0.0) + self._noise
 
 
 #: Coefficients of the forms s10, s01, s11, s20, s02, s21, s12, s22, s (rows) on θ', a', b' of the training
