@@ -1,12 +1,14 @@
-"""The admittance law of a device, M_r ẍ + D_r ẋ = u + p: checked against a log, and as source of acceleration."""
+"""A device that answers force, M_r ẍ + D_r ẋ = u + p: its law checked against a log, or as source of acceleration."""
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from bayes_impedance.config import DeviceConfig
 from bayes_impedance.errors import LogError, LogWarning
@@ -16,6 +18,42 @@ Array = NDArray[np.float64]
 
 #: Share of the variance of u + p that the law of the device has to explain before nobody is warned.
 PLAUSIBLE = 0.5
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A device that answers force, as the likelihood sees it.
+
+    Virtual mass M_r and damping D_r `(axes, 1)` [kg, Ns/m], zero where unknown; time between samples `(groups,)` [s].
+    """
+
+    device_mass: Tensor
+    device_damping: Tensor
+    step: Tensor
+
+    @classmethod
+    def of(cls, log: PreparedLog, device: DeviceConfig) -> Loop:
+        """The device and the mean time between samples of each group of `log`.
+
+        Raises:
+            ConfigurationError: an axis of the log has no virtual mass.
+        """
+        steps = []
+        for group in log.groups:
+            times = [trial.time for trial in log.trials if trial.group == group]
+            steps.append(sum(np.ptp(time) for time in times) / max(1, sum(len(time) - 1 for time in times)))
+        mass = torch.from_numpy(device.masses(log.axes)).unsqueeze(-1)
+        damping = device.dampings(log.axes)
+        known = torch.zeros_like(mass) if damping is None else torch.from_numpy(damping).unsqueeze(-1)
+        return cls(mass, known, torch.tensor(steps, dtype=mass.dtype))
+
+    def select(self, groups: list[int]) -> Loop:
+        """The same for some groups, by index."""
+        return Loop(self.device_mass, self.device_damping, self.step[groups])
+
+    def one(self, axis: int, group: int) -> Loop:
+        """The same for one axis and group, without batch dimensions."""
+        return Loop(self.device_mass[axis, 0], self.device_damping[axis, 0], self.step[group])
 
 
 def follow_law(log: PreparedLog, device: DeviceConfig) -> PreparedLog:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bayes_impedance.config import Component, Config, ModelConfig
+from bayes_impedance.device import Loop
 from bayes_impedance.errors import ConfigurationError
 from bayes_impedance.kernels.impedance import InputLayout
 from bayes_impedance.preprocessing import PreparedLog, PreparedTrial
@@ -29,8 +30,8 @@ class Features:
     `inputs` `(axes, groups, n, D)`; `force` `(axes, groups, n)` [N], None where the log has none;
     `trajectory_mean` `(axes, groups, n, 3)`: μ_xd and its derivatives [m, m/s, m/s²]; `valid`
     `(groups, n)` is False on padding, None where nothing is padded; `rows[g]` lists (trial, sample) of
-    each valid row; `device_mass` `(axes, 1)`: M_r of a device that answers force by acceleration [kg], None where
-    none does or acceleration does not enter the force.
+    each valid row; `loop`: a device that answers force by acceleration, None where none does or acceleration does not
+    enter the force.
     """
 
     groups: tuple[str, ...]
@@ -39,7 +40,7 @@ class Features:
     trajectory_mean: Tensor
     valid: Tensor | None
     rows: tuple[NDArray[np.int64], ...]
-    device_mass: Tensor | None = None
+    loop: Loop | None = None
 
 
 class FeatureMap:
@@ -128,11 +129,8 @@ class FeatureMap:
             trajectory_mean=torch.from_numpy(means),
             valid=None if valid.all() else torch.from_numpy(valid),
             rows=tuple(rows),
-            device_mass=self._device_mass(),
+            loop=None if self.device is None else Loop.of(log, self.device),
         )
-
-    def _device_mass(self) -> Tensor | None:
-        return None if self.device is None else torch.from_numpy(self.device.masses(self.axes)).unsqueeze(-1)
 
     def _trial(self, trial: PreparedTrial, mean: TrajectoryMean, label: int) -> tuple[Array, Array]:
         n, a = len(trial.time), len(self.axes)

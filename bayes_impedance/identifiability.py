@@ -11,6 +11,7 @@ import numpy as np
 from bayes_impedance.config import Config
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
 from bayes_impedance.posterior import UNITS, Posterior
+from bayes_impedance.preprocessing import PreparedTrial
 
 #: A posterior SD of half the prior's, and of √¾ of it.
 SUPPORTED, WEAK = 0.75, 0.25
@@ -45,13 +46,16 @@ class Verdict:
         return UNITS[self.latent]
 
 
-def assess(posterior: Posterior, config: Config, repetitions: int) -> list[Verdict]:
+def assess(
+    posterior: Posterior, config: Config, repetitions: int, perturbed: bool | None = None
+) -> list[Verdict]:
     """Verdicts on stiffness, damping and mass of each axis, averaged over the samples of `posterior`.
 
-    `repetitions` of one task in the forces given, of the group that has fewest. However much a posterior
-    contracts, nothing is claimed where the design of the experiment cannot tell impedance from intention.
+    `repetitions` of one task in the forces given, of the group that has fewest; `perturbed` as `was_perturbed` has it.
+    However much a posterior contracts, nothing is claimed where the design of the experiment cannot tell impedance
+    from intention.
     """
-    confounded = confounding(config, repetitions)
+    confounded = confounding(config, repetitions, perturbed)
     verdicts = []
     for latent in IMPEDANCE_ORDER:
         marginal = posterior[latent]
@@ -84,12 +88,21 @@ def classify(contraction: float) -> Support:
     return Support.WEAK if contraction >= WEAK else Support.PRIOR_ONLY
 
 
-def confounding(config: Config, repetitions: int) -> str | None:
+def was_perturbed(trials: Iterable[PreparedTrial]) -> bool | None:
+    """Whether a device perturbed any of `trials`; None where a trial has no perturbation column to tell."""
+    recorded = [trial.perturbation for trial in trials]
+    if any(perturbation is None for perturbation in recorded):
+        return None
+    return any(bool(np.any(perturbation)) for perturbation in recorded)
+
+
+def confounding(config: Config, repetitions: int, perturbed: bool | None = None) -> str | None:
     """Why this design cannot tell impedance from the desired trajectory; None where it can (docs/model.md §6).
 
     It can where the desired trajectory is known (`reference`), or where several repetitions, displaced in
     different ways, share one as a function of phase or time. A function of position takes the value x + u/k for any
-    k, and so does a desired trajectory that was seen once.
+    k, and so does a desired trajectory that was seen once. Repetitions of which the log says that nothing perturbed
+    them differ by the person alone, and return the law of the robot.
     """
     model = config.model
     mean, theta = model.desired_trajectory.mean, model.trajectory_input
@@ -104,6 +117,8 @@ def confounding(config: Config, repetitions: int) -> str | None:
         return (
             "each desired trajectory was seen once, and x_d = x + u/k fits any stiffness: repeat the motion"
         )
+    if perturbed is False:
+        return "the log says that nothing perturbed the hand, and then repetitions tell the robot's law, not the arm's"
     return None
 
 
@@ -131,12 +146,19 @@ def caveat(verdicts: Iterable[Verdict], posterior: Posterior, config: Config) ->
     """What every claim above presupposes, where the log itself cannot show it; None where nothing is claimed."""
     claims = any(verdict.support is not Support.PRIOR_ONLY for verdict in verdicts)
     known = config.model.desired_trajectory.mean in ("reference", "equilibrium")
-    if not claims or known or all(trial.perturbation is not None for trial in posterior.log.trials):
+    if not claims or known:
         return None
-    return (
-        "These verdicts presume that something other than this person displaced the hand: the log has no "
-        "perturbation column, and without perturbation the robot's own law can look like an arm."
-    )
+    if was_perturbed(posterior.log.trials) is None:
+        return (
+            "These verdicts presume that something other than this person displaced the hand: the log has no "
+            "perturbation column, and without perturbation the robot's own law can look like an arm."
+        )
+    if config.device is None:
+        return (
+            "These verdicts presume that the hand's acceleration does not answer force at once. On an admittance-"
+            "controlled robot it does, and mass and stiffness come out low: name its virtual mass in `device`."
+        )
+    return None
 
 
 def rounded(contraction: float) -> str:

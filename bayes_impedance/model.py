@@ -17,7 +17,7 @@ from bayes_impedance.engines.dense import Observations, check_capacity
 from bayes_impedance.engines.pointwise import PointPredictor
 from bayes_impedance.errors import ConfigurationError, LogError
 from bayes_impedance.features import FeatureMap, check_combination, count_repetitions, label_trials, trial_key
-from bayes_impedance.identifiability import Verdict, assess
+from bayes_impedance.identifiability import Verdict, assess, was_perturbed
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.log import InteractionLog
 from bayes_impedance.posterior import Posterior, compute_posterior
@@ -176,8 +176,8 @@ class ImpedanceModel:
         with torch.no_grad():
             given = observations(model, features)
             one = Observations(given.inputs[a, g, :n], given.residual[a, g, :n], given.noise_variance[a, 0])
-        device_mass = None if features.device_mass is None else features.device_mass[a, 0]
-        return PointPredictor(model.kernel[a, 0], one, self.config.engine.jitter, device_mass)
+        loop = None if features.loop is None else features.loop.one(a, g)
+        return PointPredictor(model.kernel[a, 0], one, self.config.engine.jitter, loop)
 
     def log_marginal_likelihood(self, log: InteractionLog | PreparedLog) -> dict[str, float]:
         """log p(force of `log`) at the model's hyperparameters, by axis, summed over groups [nats].
@@ -194,7 +194,7 @@ class ImpedanceModel:
         model = self._force_model(feature_map)
         with torch.no_grad():
             value = log_likelihood(
-                model.kernel, observations(model, features), features.device_mass, self.config.engine.jitter
+                model.kernel, observations(model, features), features.loop, self.config.engine.jitter
             ).sum(-1)
         return dict(zip(prepared.axes, value.tolist(), strict=True))
 
@@ -211,7 +211,8 @@ class ImpedanceModel:
         if posterior is None:
             posterior = self.posterior(self.fitted.log)
         known = () if self._fit is None else self._fit.log.trials
-        return assess(posterior, self.config, count_repetitions(posterior.log, known))
+        every = (*posterior.log.trials, *known)
+        return assess(posterior, self.config, count_repetitions(posterior.log, known), was_perturbed(every))
 
     def force_model(self, axes: tuple[str, ...]) -> ForceModel:
         """The gpytorch kernel, mean and likelihood underneath, to take into one's own code."""

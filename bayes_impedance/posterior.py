@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 from torch import Tensor
 
-from bayes_impedance.engines.closed_loop import MassEvidence, mass_covariance
+from bayes_impedance.engines.closed_loop import LoopEvidence
 from bayes_impedance.engines.dense import Factor
 from bayes_impedance.features import Features
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, TRAJECTORY_ORDER, InteractionKernel, Latent
@@ -191,15 +191,15 @@ class _Conditioner:
             # Covariance of b given the forces, V½ (I + V½ AᵀK⁻¹A V½)⁻¹ V½, defined for V = 0 too.
             inner = torch.linalg.inv(torch.eye(gram.shape[-1], dtype=gram.dtype) + scaled)
             self.level_covariance = root.unsqueeze(-1) * inner * root.unsqueeze(-2)
-        self.mass = None
-        if given.device_mass is not None:
-            self.mass = MassEvidence(
-                model.kernel.impedance, self.factor, observations(model, given), given.device_mass
+        self.loop = None
+        if given.loop is not None:
+            self.loop = LoopEvidence(
+                model.kernel.impedance, self.factor, observations(model, given), given.loop
             )
-            own = _level_loading(model, given.inputs[..., :1, :], Latent.MASS)
-            own = own - self.mass.white.mT @ self.white_loading
-            self.mass_loading = self.level_covariance @ own.mT
-            self.mass_variance = self.mass.variance + (own @ self.mass_loading).sum((-2, -1))
+            loading = self.loop.apparent.loading - self.loop.white.mT @ self.white_loading
+            self.loop_loading = self.level_covariance @ loading.mT
+            variance = self.loop.variance + (loading @ self.loop_loading).sum((-2, -1))
+            self.loop_gain = self.loop.gain(variance).unsqueeze(-1)
 
     def moments(self, target: Features, latents: Sequence[Latent]) -> dict[Latent, Moments]:
         result = {}
@@ -220,13 +220,11 @@ class _Conditioner:
         if self.has_levels:
             loading = prior.loading - white.mT @ self.white_loading
             variance = variance + ((loading @ self.level_covariance) * loading).sum(-1)
-        if self.mass is not None:
-            with_mass = mass_covariance(self.model.kernel.impedance, target.inputs, latent)
-            with_mass = with_mass - (white.mT @ self.mass.white).squeeze(-1)
-            location = location + with_mass * self.mass.jacobian.slope.unsqueeze(-1)
-            with_mass = with_mass + (loading @ self.mass_loading).squeeze(-1)
-            gain = self.mass.gain(self.mass_variance).unsqueeze(-1)
-            variance = (variance - with_mass.square() * gain).clamp_min(0.0)
+        if self.loop is not None:
+            with_loop = self.loop.covariance(target.inputs, latent, white)
+            location = location + with_loop * self.loop.jacobian.slope.unsqueeze(-1)
+            with_loop = with_loop + (loading @ self.loop_loading).squeeze(-1)
+            variance = (variance - with_loop.square() * self.loop_gain).clamp_min(0.0)
         if latent is Latent.FORCE:
             variance = variance + self.model.noise_variance
         return location, variance, prior.shown.expand_as(location), prior.variance.expand_as(location)
@@ -354,6 +352,7 @@ def _select_groups(features: Features, groups: Sequence[str]) -> Features:
         trajectory_mean=features.trajectory_mean[:, index],
         valid=None if features.valid is None else features.valid[index],
         rows=tuple(features.rows[i] for i in index),
+        loop=None if features.loop is None else features.loop.select(index),
     )
 
 

@@ -78,9 +78,7 @@ def observations(model: ForceModel, features: Features) -> Observations:
 
 def objective(model: ForceModel, features: Features, jitter: float) -> tuple[Tensor, Tensor]:
     """Log posterior density of the hyperparameters and log marginal likelihood, `(axes,)` each [nats]."""
-    likelihood = log_likelihood(
-        model.kernel, observations(model, features), features.device_mass, jitter
-    ).sum(-1)
+    likelihood = log_likelihood(model.kernel, observations(model, features), features.loop, jitter).sum(-1)
     return likelihood + model.log_prior(), likelihood
 
 

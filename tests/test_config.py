@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from bayes_impedance.config import (
     Config,
+    DeviceConfig,
     Hyperparameter,
     LengthScales,
     Section,
@@ -25,7 +26,7 @@ SHIPPED = shipped_configurations()
 
 #: Keys that time.yaml does not show: they act only with another kernel, mean, prior or input.
 def keys(section: type[Section], prefix: str = "") -> set[str]:
-    """Dotted keys of the schema; a hyperparameter and its length scales count as one each."""
+    """Dotted keys of the schema; a hyperparameter, its length scales and a section that is absent count as one."""
     found = set()
     for name, entry in section.model_fields.items():
         inner = [
@@ -33,7 +34,8 @@ def keys(section: type[Section], prefix: str = "") -> set[str]:
             for kind in (entry.annotation, *getattr(entry.annotation, "__args__", ()))
             if isinstance(kind, type) and issubclass(kind, Section)
         ]
-        if inner and not issubclass(inner[0], (Hyperparameter, LengthScales)):
+        absent = entry.default is None
+        if inner and not absent and not issubclass(inner[0], (Hyperparameter, LengthScales)):
             found |= keys(inner[0], f"{prefix}{name}.")
         else:
             found.add(prefix + name)
@@ -67,6 +69,7 @@ def test_shipped_configurations_are_these():
     assert set(SHIPPED) == {
         "time",
         "phase",
+        "admittance",
         "position",
         "position_velocity",
         "recordings/iiwa_known_equilibrium",
@@ -102,6 +105,11 @@ def test_time_yaml_holds_every_key_of_the_schema():
     known = keys(Config)
     content = yaml.safe_load(SHIPPED["time"].read_text(encoding="utf-8"))
     assert known - stated(content, known) == set()
+
+
+def test_admittance_yaml_holds_every_key_of_a_device():
+    content = yaml.safe_load(SHIPPED["admittance"].read_text(encoding="utf-8"))
+    assert set(content["device"]) == set(DeviceConfig.model_fields)
 
 
 def test_time_yaml_holds_the_defaults_except_for_the_rate():

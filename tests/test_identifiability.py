@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from oracles import MODEL, configuration
 
-from bayes_impedance.config import Config
+from bayes_impedance.config import Config, DeviceConfig
 from bayes_impedance.errors import ConfigurationError
 from bayes_impedance.features import count_repetitions
 from bayes_impedance.identifiability import (
@@ -20,6 +20,7 @@ from bayes_impedance.identifiability import (
     confounding,
     rounded,
     summarise,
+    was_perturbed,
 )
 from bayes_impedance.kernels import Latent
 from bayes_impedance.model import ImpedanceModel
@@ -30,14 +31,18 @@ from bayes_impedance.simulation.generative import draw_force, repeated_motion
 N = 6
 
 
-def log_with(perturbation: bool = False) -> PreparedLog:
+def log_with(perturbation: float | None = None) -> PreparedLog:
+    """One trial, perturbed by a constant force where the log records one."""
     log = repeated_motion(repetitions=1, duration=1.0, rate=float(N), seed=0)
-    if not perturbation:
+    if perturbation is None:
         return log
-    return PreparedLog(log.axes, tuple(replace(t, perturbation=np.zeros((N, 2))) for t in log.trials))
+    constant = np.full((N, 2), perturbation)
+    return PreparedLog(log.axes, tuple(replace(t, perturbation=constant) for t in log.trials))
 
 
-def posterior_with(contraction: float, prior_scale: float = 0.5, perturbation: bool = False) -> Posterior:
+def posterior_with(
+    contraction: float, prior_scale: float = 0.5, perturbation: float | None = None
+) -> Posterior:
     """Every impedance at this contraction on both axes."""
     prior = np.full((N, 2), prior_scale)
     marginals = {}
@@ -108,7 +113,12 @@ def test_claims_without_perturbation_column_come_with_a_caveat(contraction: floa
     said = caveat_of(posterior_with(contraction), config)
     assert said is not None
     assert "something other than this person displaced the hand: the log has no perturbation column" in said
-    assert caveat_of(posterior_with(contraction, perturbation=True), config) is None
+    # Perturbed by a device, of which the configuration says how it answers force.
+    device = config.model_copy(update={"device": DeviceConfig.model_validate({"mass": 2.0})})
+    assert caveat_of(posterior_with(contraction, perturbation=1.0), device) is None
+    unknown = caveat_of(posterior_with(contraction, perturbation=1.0), config)
+    assert unknown is not None
+    assert "name its virtual mass in `device`" in unknown
     # A known reference needs no perturbation, and where nothing is claimed nothing is presumed.
     assert caveat_of(posterior_with(contraction), configuration()) is None
     assert caveat_of(posterior_with(0.1), config) is None
@@ -218,6 +228,30 @@ def test_designs_that_cannot_tell_impedance_from_intention(
     config = configuration(trajectory_input=theta, desired_trajectory=trajectory)
     found = confounding(config, repetitions)
     assert (found is None) if reason is None else (found is not None and reason in found)
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "perturbed", "claims"),
+    [
+        (TRIAL_AVERAGE, None, True),
+        (TRIAL_AVERAGE, True, True),
+        (TRIAL_AVERAGE, False, False),
+        (MODEL["desired_trajectory"], False, True),
+    ],
+)
+def test_repetitions_that_nothing_perturbed_tell_of_the_robot(
+    trajectory: dict[str, object], perturbed: bool | None, claims: bool
+) -> None:
+    config = configuration(trajectory_input="phase", desired_trajectory=trajectory)
+    reason = confounding(config, 4, perturbed)
+    assert (reason is None) if claims else (reason is not None and "nothing perturbed the hand" in reason)
+
+
+def test_perturbation_is_unknown_where_one_trial_does_not_tell() -> None:
+    (silent,), (still,), (moved,) = (log_with(p).trials for p in (None, 0.0, 1.0))
+    assert was_perturbed([silent, moved]) is None
+    assert was_perturbed([still, still]) is False
+    assert was_perturbed([still, moved]) is True
 
 
 def test_contraction_without_identification_claims_nothing() -> None:

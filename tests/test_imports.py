@@ -18,18 +18,18 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             {"config", "outputs"},
             {"log", "metrics"},
             {"readers", "readers.table", "preprocessing"},
-            {"trajectory_mean"},
+            {"trajectory_mean", "device"},
             {"kernels", "kernels.stationary", "kernels.derivative", "kernels.warped", "kernels.impedance"},
             {"features"},
             {"priors"},
-            {"engines", "engines.dense", "engines.pointwise"},
+            {"engines", "engines.dense", "engines.closed_loop", "engines.pointwise"},
             {"training"},
             {"posterior"},
             {"identifiability", "baselines", "baselines.naive"},
             {"model"},
             {"persistence", "evaluation"},
             {"__init__"},
-            {"simulation", "simulation.generative", "plotting", "terminal"},
+            {"simulation", "simulation.generative", "simulation.device", "plotting", "terminal"},
             {"demo"},
             {"cli"},
             {"__main__"},
@@ -41,13 +41,21 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
 FAMILIES = (
     ("readers.table", "readers"),
     ("kernels.stationary", "kernels.derivative", "kernels.warped", "kernels.impedance", "kernels"),
-    ("engines.dense", "engines.pointwise", "engines"),
+    ("engines.dense", "engines.closed_loop", "engines.pointwise", "engines"),
     ("baselines.naive", "baselines"),
-    ("simulation.generative", "simulation"),
+    ("simulation.generative", "simulation.device", "simulation"),
 )
 
 #: Only the command line and its demo show, draw or simulate anything.
-PRESENTATION = {"cli", "demo", "terminal", "plotting", "simulation", "simulation.generative"}
+PRESENTATION = {
+    "cli",
+    "demo",
+    "terminal",
+    "plotting",
+    "simulation",
+    "simulation.generative",
+    "simulation.device",
+}
 
 #: What a kernel may know of this package: other kernels. They are to be taken into other people's code.
 FREE = ("kernels.", "metrics", "errors")

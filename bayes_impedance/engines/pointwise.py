@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from scipy.linalg.blas import dtrsv
 from torch import Tensor
 
-from bayes_impedance.engines.closed_loop import MassEvidence
+from bayes_impedance.device import Loop
+from bayes_impedance.engines.closed_loop import LoopEvidence
 from bayes_impedance.engines.dense import Factor, Observations
 from bayes_impedance.kernels.derivative import Forms, Table, combine
-from bayes_impedance.kernels.impedance import InteractionKernel, force_covariance
+from bayes_impedance.kernels.impedance import InteractionKernel, Latent, force_covariance
 from bayes_impedance.kernels.stationary import StationaryKernel
 from bayes_impedance.kernels.warped import ImpedanceProcess
 
@@ -35,7 +36,7 @@ class PointPredictor:
         kernel: without batch dimensions; its covariances must be `StationaryKernel`s or sums of them.
         observations: inputs `(n, D)`, residual `(n,)` [N], noise variance `(1,)` [N²].
         jitter: as in `engines.dense`.
-        device_mass: M_r [kg] of a device that answers force, a scalar; None for none.
+        loop: a device that answers force, of scalars; None for none.
 
     Raises:
         TypeError: a covariance of another kind.
@@ -47,7 +48,7 @@ class PointPredictor:
         kernel: InteractionKernel,
         observations: Observations,
         jitter: float = 0.0,
-        device_mass: Tensor | None = None,
+        loop: Loop | None = None,
     ) -> None:
         factor = Factor(kernel, observations, jitter)
         inputs = observations.inputs.numpy()
@@ -70,11 +71,12 @@ class PointPredictor:
         self._residual_variance = sum(part.variance for part in residual_parts)
         self._labels = None if self._layout.residual is None else inputs[:, self._layout.residual]
         self._errors = [inputs[:, c] for c in self._layout.error] or None
-        self._mass: tuple[Array, float, float] | None = None
-        if device_mass is not None:
-            evidence = MassEvidence(impedance, factor, observations, device_mass)
-            slope, gain = evidence.jacobian.slope, evidence.gain(evidence.variance)
-            self._mass = evidence.white[:, 0].numpy(), float(slope), float(gain)
+        self._loop: LoopEvidence | None = None
+        if loop is not None:
+            self._loop = LoopEvidence(impedance, factor, observations, loop)
+            self._loop_white = self._loop.white[:, 0].numpy()
+            self._loop_slope = float(self._loop.jacobian.slope)
+            self._loop_gain = float(self._loop.gain(self._loop.variance))
 
     def predict(self, x: Array) -> tuple[float, float]:
         """E and Var of a new measurement of force [N, N²] at the inputs `x` `(D,)`, levels taken as known."""
@@ -97,11 +99,14 @@ class PointPredictor:
         if errors is not None:
             mean += sum(e * w for e, w in zip(errors, weights, strict=True))
         variance = prior - float(white @ white)
-        if self._mass is not None and errors is not None:
-            white_mass, slope, gain = self._mass
-            with_mass = errors[-1] * self._processes[-1].variance - float(white @ white_mass)
-            mean += slope * with_mass
-            variance -= gain * with_mass**2
+        if self._loop is not None:
+            with torch.no_grad():
+                prior_with_loop = self._loop.apparent.covariance(
+                    torch.from_numpy(x).unsqueeze(0), Latent.FORCE
+                )
+            with_loop = float(prior_with_loop) - float(white @ self._loop_white)
+            mean += self._loop_slope * with_loop
+            variance -= self._loop_gain * with_loop**2
         return float(mean), max(variance, 0.0) + self._noise
 
 

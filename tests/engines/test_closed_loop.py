@@ -1,4 +1,4 @@
-"""The Jacobian of the closed loop against quadrature over the mass, and against the loop itself."""
+"""The Jacobian of the closed loop against quadrature over the apparent mass, and against the loop itself."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from bayes_impedance.config import Config, parse_config
-from bayes_impedance.engines.closed_loop import jacobian, log_likelihood
+from bayes_impedance.device import Loop
+from bayes_impedance.engines.closed_loop import ApparentMass, jacobian, log_likelihood
 from bayes_impedance.engines.dense import Observations, quadratic_forms
 from bayes_impedance.features import Features
 from bayes_impedance.kernels import Latent
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.posterior import compute_posterior
-from bayes_impedance.preprocessing import PreparedLog
+from bayes_impedance.preprocessing import PreparedLog, PreparedTrial
 from bayes_impedance.priors import ForceModel, build_force_model
 from bayes_impedance.simulation.device import STEP, Admittance, Arm, Signal, held_impedance
 from bayes_impedance.simulation.generative import draw_force, repeated_motion
 from bayes_impedance.training import objective, observations
 from bayes_impedance.trajectory_mean import TrajectoryMean
 
-DEVICE_MASS = 2.0
+DEVICE_MASS, DEVICE_DAMPING = 2.0, 6.0
 
 
 def fixed_levels(device: bool = True, **model: object) -> Config:
@@ -40,39 +41,63 @@ def fixed_levels(device: bool = True, **model: object) -> Config:
         noise_sd=0.2,
         **model,
     ).model_dump(mode="json")
-    return parse_config(content | {"device": {"mass": DEVICE_MASS} if device else None})
+    return parse_config(
+        content | {"device": {"mass": DEVICE_MASS, "damping": DEVICE_DAMPING} if device else None}
+    )
 
 
 def problem(config: Config, rate: float = 12.0) -> tuple[PreparedLog, Features, ForceModel]:
     motion = repeated_motion(2, duration=2.0, rate=rate, displacement_sd=0.03, seed=4)
     log = draw_force(config, motion, seed=4)
+    log = PreparedLog(log.axes, tuple(driven(trial) for trial in log.trials))
     features = feature_map(config, log)(
         log, TrajectoryMean.from_training(config.model.desired_trajectory, log)
     )
     return log, features, build_force_model(config, feature_map(config, log))
 
 
-class Quadrature:
-    """p(m | u) ∝ N(u; m) (1 + m/M_r)ⁿ N(m; μ, σ²) on a grid of m, for axis 0 and group 0."""
+def driven(trial: PreparedTrial) -> PreparedTrial:
+    """The perturbation under which the device moves as the trial does."""
+    answer = DEVICE_MASS * trial.acceleration + DEVICE_DAMPING * trial.velocity
+    return replace(trial, perturbation=answer - trial.force)
 
-    def __init__(self, model: ForceModel, features: Features) -> None:
+
+class Quadrature:
+    """p(z | u) ∝ N(u; z) (1 + z/M_r)ⁿ N(z) on a grid of z, for axis 0, group 0 and constant damping."""
+
+    def __init__(self, model: ForceModel, features: Features, step: float) -> None:
         self.kernel, self.x = model.kernel, features.inputs[0, 0]
         impedance = self.kernel.impedance
-        mean, sd = float(impedance.mass.level[0]), float(impedance.mass.covariance.sd[0])
-        self.m = torch.linspace(mean - 6 * sd, mean + 6 * sd, 1201, dtype=torch.float64)
-        self.prior = torch.distributions.Normal(mean, sd).log_prob(self.m)
-        self.variance = sd**2
-        self.error = self.x[:, impedance.layout.error[2]]
+        mass, mass_sd = float(impedance.mass.level[0]), float(impedance.mass.covariance.sd[0])
+        median, log_sd = float(impedance.damping.level[0]), float(impedance.damping.covariance.sd[0])
+        damping = median * np.exp(0.5 * log_sd**2)
+        damping_variance = damping**2 * np.expm1(log_sd**2)
+        share = 1.0 - 0.5 * step * DEVICE_DAMPING / DEVICE_MASS
+        # z = share · m + ½ Δ d
+        self.mean = share * mass + 0.5 * step * damping
+        self.variance = (share * mass_sd) ** 2 + (0.5 * step) ** 2 * damping_variance
+        sd = np.sqrt(self.variance)
+        self.z = torch.linspace(self.mean - 6 * sd, self.mean + 6 * sd, 1201, dtype=torch.float64)
         n = len(self.x)
-        whole = self.covariance(self.x, Latent.FORCE) + model.noise_variance[0, 0] * torch.eye(
-            n, dtype=torch.float64
+        constant = torch.ones(n, dtype=torch.float64)
+        errors = [self.x[:, column] for column in impedance.layout.error]
+        #: Covariance of z with each latent, or its logarithm.
+        self.with_z = {
+            Latent.FORCE: errors[2] * share * mass_sd**2 + 0.5 * step * errors[1] * damping_variance,
+            Latent.MASS: constant * share * mass_sd**2,
+            Latent.DAMPING: constant * 0.5 * step * damping * log_sd**2,
+        }
+        column = self.with_z[Latent.FORCE]
+        noise = model.noise_variance[0, 0] * torch.eye(n, dtype=torch.float64)
+        # What is left of the covariance once z is known, and the residual at each z.
+        self.rest = (
+            self.covariance(self.x, Latent.FORCE) + noise - torch.outer(column, column) / self.variance
         )
-        # What is left of the covariance once m is known, and the residual at each m.
-        self.rest = whole - self.variance * torch.outer(self.error, self.error)
         residual = features.force[0, 0] - model.prior_mean(features.inputs)[0, 0]
-        self.residuals = residual - torch.outer(self.m - mean, self.error)
+        self.residuals = residual - torch.outer((self.z - self.mean) / self.variance, column)
         density = MultivariateNormal(torch.zeros(n, dtype=torch.float64), self.rest).log_prob(self.residuals)
-        self.log_joint = self.prior + density + n * torch.log1p(self.m / DEVICE_MASS)
+        prior = torch.distributions.Normal(self.mean, sd).log_prob(self.z)
+        self.log_joint = prior + density + n * torch.log1p(self.z / DEVICE_MASS)
         self.weights = torch.softmax(self.log_joint, 0)
 
     def covariance(self, x: Tensor, latent: Latent) -> Tensor:
@@ -80,20 +105,23 @@ class Quadrature:
 
     @property
     def log_evidence(self) -> float:
-        total = torch.logsumexp(self.log_joint, 0) + torch.log(self.m[1] - self.m[0])
+        total = torch.logsumexp(self.log_joint, 0) + torch.log(self.z[1] - self.z[0])
         return float(total.detach())
 
-    def moments(self, x: Tensor, latent: Latent, error: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and variance of a latent at `x` less its prior mean; `error` is what m multiplies in it."""
-        cross = self.covariance(x, latent) - self.variance * torch.outer(self.error, error)
-        at_m = torch.linalg.solve(self.rest, cross)
-        means = self.residuals @ at_m + torch.outer(
-            self.m - float(self.kernel.impedance.mass.level[0]), error
-        )
-        own = self.kernel.prior_variance(x[None, None], latent)[0, 0] - self.variance * error**2
-        conditional = own - (cross * at_m).sum(0)
+    def moments(self, latent: Latent) -> tuple[Tensor, Tensor]:
+        """Mean and variance of a latent at every sample, less its prior mean."""
+        own = self.with_z.get(latent, torch.zeros(len(self.x), dtype=torch.float64))
+        cross = self.covariance(self.x, latent)
+        cross = cross - torch.outer(self.with_z[Latent.FORCE], own) / self.variance
+        at_z = torch.linalg.solve(self.rest, cross)
+        means = self.residuals @ at_z + torch.outer((self.z - self.mean) / self.variance, own)
+        prior = self.kernel.prior_variance(self.x[None, None], latent)[0, 0] - own**2 / self.variance
         mean = self.weights @ means
-        return mean, conditional + self.weights @ (means - mean) ** 2
+        return mean, prior - (cross * at_z).sum(0) + self.weights @ (means - mean) ** 2
+
+
+def step_of(log: PreparedLog) -> float:
+    return float(np.mean(np.diff(log.trials[0].time)))
 
 
 @pytest.mark.parametrize("count", [20, 200, 2000])
@@ -123,7 +151,7 @@ def test_known_mass_leaves_the_plain_jacobian() -> None:
     assert float(known.log_expectation) == pytest.approx(50 * np.log1p(0.6), rel=1e-14)
 
 
-def test_determinant_of_the_simulated_loop_is_that_of_the_formula() -> None:
+def test_determinant_of_a_loop_that_holds_its_force_is_that_of_the_mass() -> None:
     """∂u/∂(what the force holds beside the impedance), column by column."""
     arm, device, n = Arm(), Admittance(), 40
     time = STEP * np.arange(n)
@@ -134,19 +162,53 @@ def test_determinant_of_the_simulated_loop_is_that_of_the_formula() -> None:
     assert log_det == pytest.approx(-n * np.log1p(arm.mass / device.mass), rel=1e-12)
 
 
-def test_likelihood_equals_quadrature_over_the_mass() -> None:
+def test_determinant_of_a_loop_whose_force_is_smooth_has_half_a_step_of_both_dampings() -> None:
+    """∂(u + k x + d ẋ + m ẍ)/∂u at samples between which u is a straight line."""
+    arm, device, n, step, fine = Arm(), Admittance(), 60, 0.04, 200
+    grid = np.arange(n * fine - fine + 1) / fine
+    columns = []
+    for unit in np.eye(n):
+        force = np.interp(grid, np.arange(n), unit)
+        x = v = 0.0
+        rows = []
+        for i, u in enumerate(force):
+            a = (u - device.damping * v) / device.mass
+            if i % fine == 0:
+                rows.append(u + arm.stiffness * x + arm.damping * v + arm.mass * a)
+            middle = 0.5 * (u + force[min(i + 1, len(force) - 1)])
+            h = step / fine
+            a = (middle - device.damping * (v + 0.5 * h * a)) / device.mass
+            x, v = x + h * v + 0.5 * h**2 * a, v + h * a
+        columns.append(rows)
+    _, log_det = np.linalg.slogdet(np.array(columns))
+    mass_alone = n * np.log1p(arm.mass / device.mass)
+    share = 1.0 - 0.5 * step * device.damping / device.mass
+    expected = n * np.log1p((share * arm.mass + 0.5 * step * arm.damping) / device.mass)
+    assert expected - mass_alone > 1.0
+    # What is left is of second order in the step, k Δ²/6 the largest of it.
+    second = n * arm.stiffness * step**2 / 6.0 / (device.mass + arm.mass)
+    assert log_det - second == pytest.approx(expected, abs=0.15 * (expected - mass_alone))
+
+
+def test_likelihood_equals_quadrature_over_the_apparent_mass() -> None:
     config = fixed_levels()
-    _, features, model = problem(config)
-    value = log_likelihood(model.kernel, observations(model, features), features.device_mass, jitter=0.0)
-    assert float(value[0, 0].detach()) == pytest.approx(Quadrature(model, features).log_evidence, abs=0.01)
+    log, features, model = problem(config)
+    value = log_likelihood(model.kernel, observations(model, features), features.loop, jitter=0.0)
+    assert float(value[0, 0].detach()) == pytest.approx(
+        Quadrature(model, features, step_of(log)).log_evidence, abs=0.01
+    )
 
 
 def test_without_a_device_nothing_is_added() -> None:
     config = fixed_levels(device=False)
     _, features, model = problem(config)
-    assert features.device_mass is None
+    assert features.loop is None
     value, _ = objective(model, features, 0.0)
-    with_device, _ = objective(model, replace(features, device_mass=double([[1e12], [1e12]])), 0.0)
+    with_device, _ = objective(
+        model,
+        replace(features, loop=Loop(double([[1e12], [1e12]]), double([[0.0], [0.0]]), double([0.1]))),
+        0.0,
+    )
     torch.testing.assert_close(value, with_device, rtol=1e-9, atol=1e-9)
 
 
@@ -154,35 +216,32 @@ def test_acceleration_that_does_not_enter_the_force_has_no_jacobian() -> None:
     content = fixed_levels().model_dump(mode="json")
     content["model"]["desired_trajectory"]["mean"] = "equilibrium"
     _, features, _ = problem(parse_config(content))
-    assert features.device_mass is None
+    assert features.loop is None
 
 
 @pytest.mark.parametrize("latent", list(Latent))
-def test_posterior_equals_quadrature_over_the_mass(latent: Latent) -> None:
+def test_posterior_equals_quadrature_over_the_apparent_mass(latent: Latent) -> None:
     config = fixed_levels()
     log, features, model = problem(config)
     marginal = compute_posterior(model, log, features, features, 0.0, [latent])[latent]
-    oracle = Quadrature(model, features)
-    x = features.inputs[0, 0]
-    multiplied = {Latent.FORCE: oracle.error, Latent.MASS: torch.ones(len(x), dtype=torch.float64)}
-    error = multiplied.get(latent, torch.zeros(len(x), dtype=torch.float64))
     with torch.no_grad():
-        mean, variance = oracle.moments(x, latent, error)
+        mean, variance = Quadrature(model, features, step_of(log)).moments(latent)
     if latent is Latent.FORCE:
         variance = variance + model.noise_variance.detach()[0, 0]
     shift = marginal.location[:, 0] - marginal.prior_location[:, 0]
     scale = marginal.scale[:, 0]
-    # Laplace's method gives the mode of m, the quadrature its mean: a tenth of a posterior SD apart at most.
+    # Laplace's method gives the mode of z, the quadrature its mean: a tenth of a posterior SD apart at most.
     np.testing.assert_allclose(shift, mean.detach(), atol=float(0.1 * scale.max()), rtol=0.0)
     np.testing.assert_allclose(scale, variance.detach().sqrt(), rtol=0.05)
 
 
-def test_the_jacobian_raises_the_mass() -> None:
+def test_the_jacobian_raises_mass_and_damping() -> None:
     log, features, model = problem(fixed_levels())
-    with_it = compute_posterior(model, log, features, features, 0.0)["mass"]
-    without = compute_posterior(model, log, features, replace(features, device_mass=None), 0.0)["mass"]
-    assert (with_it.mean > without.mean + without.sd).all()
-    assert (with_it.sd < without.sd).all()
+    with_it = compute_posterior(model, log, features, features, 0.0)
+    without = compute_posterior(model, log, features, replace(features, loop=None), 0.0)
+    for name in ("mass", "damping"):
+        assert (with_it[name].location > without[name].location).all()
+        assert (with_it[name].scale < without[name].scale).all()
 
 
 def test_gradient_of_the_objective_is_that_of_finite_differences() -> None:
@@ -208,6 +267,36 @@ def test_gradient_of_the_objective_is_that_of_finite_differences() -> None:
         assert float(entry.raw.grad.view(-1)[0]) == pytest.approx(numeric, rel=1e-4, abs=1e-4), entry.name
 
 
+def test_apparent_mass_of_damping_along_the_path_is_a_double_sum() -> None:
+    content = fixed_levels().model_dump(mode="json")
+    content["model"]["damping"] |= {"input": ["position"], "log_sd": {"median": 0.4, "fixed": True}}
+    log, features, model = problem(parse_config(content))
+    impedance, given = model.kernel.impedance, observations(model, features)
+    with torch.no_grad():
+        apparent = ApparentMass(impedance, given, features.loop)
+        x = features.inputs
+        half = 0.5 * step_of(log)
+        covariance = impedance.damping(x, x).to_dense()
+        log_covariance = impedance.damping.gaussian_covariance(x, x)
+        expected = impedance.damping.expectation(x)[..., 0]
+        mass = impedance.mass.covariance.sd[..., 0, 0] ** 2
+        n = x.shape[-2]
+        share = 1.0 - half * DEVICE_DAMPING / DEVICE_MASS
+        mean = share * impedance.mass.level[..., 0, 0] + half * expected.mean(-1)
+        torch.testing.assert_close(apparent.mean, mean)
+        torch.testing.assert_close(
+            apparent.variance, share**2 * mass + half**2 * covariance.sum((-2, -1)) / n**2
+        )
+        errors = impedance.layout.errors(x, 2)
+        force = errors[2][..., 0] * share * mass.unsqueeze(-1) + half * errors[1][..., 0] * covariance.mean(
+            -1
+        )
+        torch.testing.assert_close(apparent.covariance(x, Latent.FORCE), force)
+        damping = half * (log_covariance * expected.unsqueeze(-2)).mean(-1)
+        torch.testing.assert_close(apparent.covariance(x, Latent.DAMPING), damping)
+        assert not apparent.covariance(x, Latent.STIFFNESS).any()
+
+
 def test_padding_does_not_count() -> None:
     config = fixed_levels()
     _, features, model = problem(config)
@@ -219,8 +308,8 @@ def test_padding_does_not_count() -> None:
         given.noise_variance,
         (torch.arange(n + 5) < n).expand(1, n + 5),
     )
-    one = log_likelihood(model.kernel, given, features.device_mass, 0.0)
-    other = log_likelihood(model.kernel, padded, features.device_mass, 0.0)
+    one = log_likelihood(model.kernel, given, features.loop, 0.0)
+    other = log_likelihood(model.kernel, padded, features.loop, 0.0)
     torch.testing.assert_close(one, other, rtol=1e-11, atol=1e-11)
 
 
@@ -265,9 +354,7 @@ def test_one_point_prediction_knows_the_loop() -> None:
 def test_model_reports_the_likelihood_with_the_jacobian() -> None:
     config = fixed_levels()
     log, features, model = problem(config)
-    value = log_likelihood(
-        model.kernel, observations(model, features), features.device_mass, config.engine.jitter
-    )
+    value = log_likelihood(model.kernel, observations(model, features), features.loop, config.engine.jitter)
     reported = ImpedanceModel(config).log_marginal_likelihood(log)
     for a, axis in enumerate(log.axes):
         assert reported[axis] == pytest.approx(float(value[a].sum().detach()), rel=1e-12)
