@@ -94,9 +94,7 @@ class ImpedanceModel:
         Raises:
             LogError, ConfigurationError: the log cannot serve this configuration.
         """
-        prepared = log if isinstance(log, PreparedLog) else prepare(log, self.config.preprocessing)
-        if self.config.device is not None:
-            prepared = follow_law(prepared, self.config.device)
+        prepared = log if isinstance(log, PreparedLog) else self._prepared(log)
         check_combination(self.config, prepared)
         if self._fit is not None and prepared.axes != self._fit.log.axes:
             raise LogError(
@@ -217,6 +215,10 @@ class ImpedanceModel:
     def force_model(self, axes: tuple[str, ...]) -> ForceModel:
         """The gpytorch kernel, mean and likelihood underneath, to take into one's own code."""
         return self._force_model(FeatureMap(self.config, axes))
+
+    def _prepared(self, log: InteractionLog) -> PreparedLog:
+        prepared = prepare(log, self.config.preprocessing)
+        return prepared if self.config.device is None else follow_law(prepared, self.config.device)
 
     def _force_model(self, feature_map: FeatureMap) -> ForceModel:
         # A copy, so that nobody changes a fitted model from outside.

@@ -20,7 +20,7 @@ from bayes_impedance.features import Features
 from bayes_impedance.kernels import Latent
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.posterior import compute_posterior
-from bayes_impedance.preprocessing import PreparedLog, PreparedTrial
+from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.priors import ForceModel, build_force_model
 from bayes_impedance.simulation.device import STEP, Admittance, Arm, Signal, held_impedance
 from bayes_impedance.simulation.generative import draw_force, repeated_motion
@@ -49,17 +49,10 @@ def fixed_levels(device: bool = True, **model: object) -> Config:
 def problem(config: Config, rate: float = 12.0) -> tuple[PreparedLog, Features, ForceModel]:
     motion = repeated_motion(2, duration=2.0, rate=rate, displacement_sd=0.03, seed=4)
     log = draw_force(config, motion, seed=4)
-    log = PreparedLog(log.axes, tuple(driven(trial) for trial in log.trials))
     features = feature_map(config, log)(
         log, TrajectoryMean.from_training(config.model.desired_trajectory, log)
     )
     return log, features, build_force_model(config, feature_map(config, log))
-
-
-def driven(trial: PreparedTrial) -> PreparedTrial:
-    """The perturbation under which the device moves as the trial does."""
-    answer = DEVICE_MASS * trial.acceleration + DEVICE_DAMPING * trial.velocity
-    return replace(trial, perturbation=answer - trial.force)
 
 
 class Quadrature:
