@@ -1,6 +1,7 @@
 """Scores: pooled over trials, from the training forces alone, beside a naive GP that gpytorch agrees with."""
 
 import json
+from contextlib import contextmanager
 from dataclasses import replace
 
 import gpytorch
@@ -154,12 +155,18 @@ def test_no_warning_for_unseen_trials(tiny, other, recwarn):
 
 def test_json(tiny, other):
     seen = []
-    scores = evaluate(tiny.fitted, other, naive=True, progress=lambda *step: seen.append(step))
+
+    @contextmanager
+    def watch(config, what):
+        seen.append((config, what))
+        yield lambda *step: seen.append(step[:2])
+
+    scores = evaluate(tiny.fitted, other, ["naive"], progress=watch)
     content = json.loads(json.dumps(as_json(scores)))
     assert content == {
         "axes": {
             axis: {name: values.as_dict() for name, values in models.items()}
-            for axis, models in scores.items()
+            for axis, models in scores.scores.items()
         }
     }
     for axis in "xy":
@@ -167,7 +174,7 @@ def test_json(tiny, other):
         for values in content["axes"][axis].values():
             assert list(values) == ["smse", "msll", "nlpd", "coverage90", "n"]
     # The progress is that of the baseline's training.
-    assert [step[:2] for step in seen] == [(0, 1), (0, 2), (0, 3)]
+    assert seen == [(tiny.config.training, "naive"), (0, 1), (0, 2), (0, 3)]
 
 
 def test_log_without_force(tiny):
