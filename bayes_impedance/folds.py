@@ -104,8 +104,9 @@ def _last_third(log: PreparedLog, config: Config) -> Fold:
     for trial in log.trials:
         start = trial.n_samples - max(trial.n_samples // 3, 1)
         held_out = np.arange(trial.n_samples) >= start
-        # Two windows share no raw sample when their centres are further apart than one of them is long.
-        known = trial.time[start] - trial.time > window
+        # Two windows share no raw sample when their centres are further apart than one of them is long; differences of
+        # time stamps carry rounding errors.
+        known = trial.time[start] - trial.time > window * (1 + 1e-6)
         if not known.any():
             raise LogError(
                 f"{_at(trial)}: expected samples before its last third and one window of the smoother ({window:g} s), "
