@@ -116,13 +116,9 @@ def _last_third(log: PreparedLog, config: Config) -> Fold:
         names.append(f"{_at(trial)}, from {trial.time[start]:g} s")
         training.append(_with_force_at(trial, known))
         test.append(_with_force_at(trial, held_out))
-    fold = Fold(
-        tuple(names),
-        PreparedLog(log.axes, tuple(training)),
-        # The very trials that train, so that each goes on with its own x_d and offset of the residual.
-        PreparedLog(log.axes, tuple(training)),
-        PreparedLog(log.axes, tuple(test)),
-    )
+    begun = PreparedLog(log.axes, tuple(training))
+    # The very trials that train are the target, so that each goes on with its own x_d and offset of the residual.
+    fold = Fold(tuple(names), begun, begun, PreparedLog(log.axes, tuple(test)))
     _question_phase(fold, config)
     return fold
 
