@@ -1,13 +1,15 @@
 """Interaction forces between a person and a robot: arm impedance and intention by Gaussian processes.
 
-High level: `read_log`, `load_config`, `ImpedanceModel`, `evaluate`, `save_model`, `load_model`. Under it:
-`bayes_impedance.kernels`, ordinary gpytorch kernels to take into one's own code.
+High level: `read_log`, `load_config`, `ImpedanceModel`, `evaluate`, `cross_validate`, `save_model`, `load_model`.
+Under it: `bayes_impedance.kernels`, ordinary gpytorch kernels to take into one's own code.
 """
 
 from bayes_impedance.config import Config as Config
 from bayes_impedance.config import load_config as load_config
+from bayes_impedance.cross_validation import cross_validate as cross_validate
 from bayes_impedance.errors import BayesImpedanceError as BayesImpedanceError
 from bayes_impedance.evaluation import evaluate as evaluate
+from bayes_impedance.explained import impedance_share as impedance_share
 from bayes_impedance.identifiability import Support as Support
 from bayes_impedance.identifiability import Verdict as Verdict
 from bayes_impedance.kernels.impedance import Latent as Latent

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import sys
 import warnings
+from collections.abc import Sequence
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -16,8 +18,11 @@ from rich.markup import escape
 
 from bayes_impedance import terminal
 from bayes_impedance.config import load_config, shipped_configurations
+from bayes_impedance.contenders import Baseline
+from bayes_impedance.cross_validation import as_json as folds_as_json
+from bayes_impedance.cross_validation import cross_validate
 from bayes_impedance.demo import record, truth_errors
-from bayes_impedance.errors import BayesImpedanceError, LogWarning, OutputError
+from bayes_impedance.errors import BayesImpedanceError, ConfigurationError, LogError, LogWarning, OutputError
 from bayes_impedance.evaluation import as_json, evaluate
 from bayes_impedance.identifiability import summarise
 from bayes_impedance.kernels.impedance import Latent
@@ -76,10 +81,21 @@ class Given(str, Enum):
     log = "log"
 
 
-class Baseline(str, Enum):
-    """Competitors of evaluate."""
+class Competitor(str, Enum):
+    """Baselines of evaluate."""
 
     naive = "naive"
+    without_residual = "without-residual"
+
+
+class Split(str, Enum):
+    """Folds of evaluate."""
+
+    trials = "trials"
+    last_third = "last-third"
+
+
+HELD_OUT = {Split.trials: "each trial, left out in turn", Split.last_third: "the last third of each trial"}
 
 
 def main() -> None:
@@ -132,8 +148,8 @@ def demo(
     listed = ", ".join(f"{name} {error:.1%}" for name, error in errors.items())
     console.print(f"Mean relative error against the truth: {listed}", highlight=False)
     unseen = model.prepare(read_log(recording.testing, recording.config.log))
-    with terminal.training_progress(console, recording.config.training, "naive GP") as progress:
-        scores = evaluate(model, unseen, naive=True, progress=progress)
+    watch = partial(terminal.training_progress, console)
+    scores = evaluate(model, unseen, ["naive"], progress=watch)
     console.print(terminal.evaluation_table(scores))
     _write_posterior(posterior, out / "posterior.csv")
     figures = [*save_figures(posterior, verdicts, out), out / "predicted_force.png"]
@@ -218,22 +234,64 @@ def infer(
 @app.command(name="evaluate")
 def evaluate_command(
     model: Model,
-    logs: Logs,
-    baseline: Annotated[Baseline | None, typer.Option(help="Competitor trained on the same data.")] = None,
+    logs: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="LOG",
+            help="Recordings to score on; with --folds they may be left out, for those of MODEL's training.",
+            show_default=False,
+        ),
+    ] = None,
+    baseline: Annotated[
+        list[Competitor] | None,
+        typer.Option(help="Competitor trained on the same data; repeatable.", show_default=False),
+    ] = None,
+    against: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="MODEL_OR_CONFIG",
+            help="Another model folder, or a configuration to be trained on the same data; repeatable.",
+            show_default=False,
+        ),
+    ] = None,
+    folds: Annotated[
+        Split | None,
+        typer.Option(
+            help="Cross-validate MODEL's configuration, trained anew: leave out each trial, or the last third of each.",
+            show_default=False,
+        ),
+    ] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the scores to this file.")] = None,
 ) -> None:
-    """Score predicted force on LOG, given the training forces only: SMSE, MSLL, NLPD, coverage of the 90 % band."""
+    """Score predicted force on LOG, given the training forces only: SMSE, MSLL, NLPD, coverage of the 90 % band.
+
+    The share of impedance is how much of the variance of the training force it explains.
+    """
     console = Console()
     if json_file is not None:
         check_writable(json_file)
     trained = load_model(model)
-    log = read_log(logs, trained.config.log)
-    with terminal.training_progress(console, trained.config.training, "naive GP") as progress:
-        scores = evaluate(trained, log, naive=baseline is Baseline.naive, progress=progress)
-    console.print(terminal.evaluation_table(scores))
+    others = _others(against or [])
+    baselines: list[Baseline] = [option.value for option in baseline or []]
+    log = read_log(logs, trained.config.log) if logs else None
+    watch = partial(terminal.training_progress, console)
+    if folds is not None:
+        result = cross_validate(trained, log, folds.value, baselines, others, watch)
+        count = len(result.folds)
+        title = f"Predicted force of {HELD_OUT[folds]}, {count} fold{'s' if count > 1 else ''}"
+        console.print(terminal.evaluation_table(result.pooled, title))
+        content = folds_as_json(result)
+    elif log is None:
+        raise LogError(
+            "expected a LOG to score on, found none; name one, or cross-validate on MODEL's training log with --folds"
+        )
+    else:
+        scores = evaluate(trained, log, baselines, others, watch)
+        console.print(terminal.evaluation_table(scores))
+        content = as_json(scores)
     if json_file is not None:
         with whole_file(json_file) as temporary:
-            temporary.write_text(json.dumps(as_json(scores), indent=2) + "\n", encoding="utf-8")
+            temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
         console.print(f"wrote {json_file}", highlight=False, soft_wrap=True)
 
 
@@ -261,6 +319,25 @@ def show(
     console.print(terminal.hyperparameter_table(trained))
     console.print(terminal.restart_table(trained))
     terminal.print_verdicts(console, trained, posterior)
+
+
+def _others(sources: Sequence[str]) -> dict[str, ImpedanceModel]:
+    """Models to compare with, by the last part of their folder's or file's name; a second of a name is numbered."""
+    others: dict[str, ImpedanceModel] = {}
+    for source in sources:
+        path = Path(source)
+        if path.is_dir():
+            name, model = path.resolve().name, load_model(path)
+        elif path.is_file() or source in shipped_configurations():
+            name, model = path.name.removesuffix(".yaml"), ImpedanceModel(load_config(source))
+        else:
+            raise ConfigurationError(
+                f"--against: expected a model folder, a YAML file or the name of a shipped configuration, found "
+                f"none of them at '{source}'; shipped are {', '.join(shipped_configurations())}."
+            )
+        taken = sum(other == name or other.startswith(f"{name} (") for other in others)
+        others[f"{name} ({taken + 1})" if taken else name] = model
+    return others
 
 
 def _posterior_format(path: Path) -> str:

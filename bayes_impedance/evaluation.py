@@ -1,60 +1,93 @@
-"""Scores of a trained model on logs it has not seen, beside a naive GP."""
+"""Scores of a trained model on logs it has not seen, beside baselines and other models."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bayes_impedance.baselines.naive import NaiveModel
+from bayes_impedance.contenders import (
+    IMPEDANCE,
+    Baseline,
+    Contender,
+    Predictor,
+    Watch,
+    baseline_contenders,
+    check_comparable,
+    predict_force,
+)
 from bayes_impedance.errors import LogError, LogWarning
+from bayes_impedance.explained import EXPLAINING, impedance_share
 from bayes_impedance.features import trial_key
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.log import InteractionLog
-from bayes_impedance.metrics import Scores, score
+from bayes_impedance.metrics import Prediction, Scores, score, varies
 from bayes_impedance.model import ImpedanceModel
-from bayes_impedance.posterior import Posterior
 from bayes_impedance.preprocessing import PreparedLog
-from bayes_impedance.training import Progress
 
-#: axis → name of the model → scores
-Evaluation = dict[str, dict[str, Scores]]
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Scores by axis and model.
+
+    `scores[axis][model]`; `impedance_share[axis][model]`: share of the training force that impedance explains (see
+    `impedance_share`), of models that have an impedance.
+    """
+
+    scores: Mapping[str, Mapping[str, Scores]]
+    impedance_share: Mapping[str, Mapping[str, float]]
+
+    def __getitem__(self, axis: str) -> Mapping[str, Scores]:
+        """Scores of one axis by model."""
+        return self.scores[axis]
 
 
 def evaluate(
     model: ImpedanceModel,
     log: InteractionLog | PreparedLog,
-    naive: bool = False,
-    progress: Progress | None = None,
+    baselines: Sequence[Baseline] = (),
+    against: Mapping[str, ImpedanceModel] | None = None,
+    progress: Watch | None = None,
 ) -> Evaluation:
-    """Score the force of `log` predicted from the training forces alone; optionally train a naive GP beside.
+    """Score the force of `log` predicted from the training forces alone.
+
+    `baselines` are trained on the model's training log, as are those of `against` (name → model) that are not fitted;
+    one that is fitted counts as it is. MSLL of every row is against the forces that `model` was trained on.
 
     Raises:
         LogError: the log has no force, or the same force throughout.
+        ConfigurationError: a baseline is unknown, or a model of `against` is not of the same samples.
     """
+    against = against or {}
     prepared = model.prepare(log)
     if any(trial.force is None for trial in prepared.trials):
         raise LogError("expected a log with force to score against, found none; name log.columns.force")
     training = model.fitted.log
-    _check_variation(prepared)
-    seen = {trial_key(trial) for trial in training.trials}
-    if any(trial_key(trial) in seen for trial in prepared.trials):
-        warnings.warn(
-            "some of these trials were trained on, so their scores tell how well they are remembered, not predicted",
-            LogWarning,
-            stacklevel=2,
-        )
-    predictions = {"impedance": model.posterior(prepared, given="training", latents=[Latent.FORCE])}
-    if naive:
-        competitor = NaiveModel(model.config, training, progress)
-        if competitor.report.interrupted:
-            # Half trained it would be no fair competitor.
-            raise KeyboardInterrupt
-        predictions["naive"] = competitor.predict(prepared)
-    return {
-        axis: {name: _scores(posterior, training, a) for name, posterior in predictions.items()}
-        for a, axis in enumerate(prepared.axes)
+    check_variation(prepared, "score against")
+    check_comparable(model.config, against)
+    fitted = {IMPEDANCE: model} | {name: other for name, other in against.items() if other.is_fitted}
+    for name, other in fitted.items():
+        other.prepare(prepared)
+        _question_training(name, other, training, prepared)
+    others = [Contender(name, other.config) for name, other in against.items() if not other.is_fitted]
+    trained: dict[str, Predictor] = {
+        contender.name: contender.train(training, progress)
+        for contender in (*baseline_contenders(model.config, baselines), *others)
     }
+    rows = (IMPEDANCE, *(name for name in trained if name not in against), *against)
+    predictors = {name: (fitted | trained)[name] for name in rows}
+    predictions = predict(predictors, training, prepared, prepared)
+    return Evaluation(
+        {
+            axis: {name: score(p.mean, p.sd, p.force, p.training_force) for name, p in models.items()}
+            for axis, models in predictions.items()
+        },
+        shares(predictors, prepared.axes),
+    )
 
 
 def as_json(evaluation: Evaluation) -> dict[str, object]:
@@ -62,26 +95,77 @@ def as_json(evaluation: Evaluation) -> dict[str, object]:
     return {
         "axes": {
             axis: {name: scores.as_dict() for name, scores in models.items()}
-            for axis, models in evaluation.items()
+            for axis, models in evaluation.scores.items()
         }
     }
 
 
-def _check_variation(log: PreparedLog) -> None:
+def predict(
+    predictors: Mapping[str, Predictor], training: PreparedLog, target: PreparedLog, test: PreparedLog
+) -> dict[str, dict[str, Prediction]]:
+    """Axis → model → prediction of the known forces of `test`, whose samples are those of `target`."""
+    known = np.concatenate([trial.observed for trial in test.trials])
+    marginals = {
+        name: predict_force(predictor, target)[Latent.FORCE] for name, predictor in predictors.items()
+    }
+    return {
+        axis: {
+            name: Prediction(
+                marginal.mean[known, a], marginal.sd[known, a], known_force(test, a), known_force(training, a)
+            )
+            for name, marginal in marginals.items()
+        }
+        for a, axis in enumerate(test.axes)
+    }
+
+
+def shares(predictors: Mapping[str, Predictor], axes: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Axis → model → share of its own training force that impedance explains; a naive GP has no impedance."""
+    explained = {
+        name: impedance_share(predictor.posterior(predictor.fitted.log, latents=EXPLAINING))
+        for name, predictor in predictors.items()
+        if not isinstance(predictor, NaiveModel)
+    }
+    return {axis: {name: float(share[a]) for name, share in explained.items()} for a, axis in enumerate(axes)}
+
+
+def known_force(log: PreparedLog, axis: int) -> NDArray[np.float64]:
+    """Known forces of one axis, trial after trial [N]."""
+    return np.concatenate(
+        [trial.force[trial.observed, axis] for trial in log.trials if trial.force is not None]
+    )
+
+
+def check_variation(log: PreparedLog, purpose: str) -> None:
+    """Refuse a force that rests along an axis.
+
+    Raises:
+        LogError: SMSE or MSLL would divide by nought.
+    """
     for a, axis in enumerate(log.axes):
-        force = np.concatenate([trial.force[:, a] for trial in log.trials if trial.force is not None])
-        # A constant that went through the smoother carries rounding errors.
-        if np.ptp(force) <= 1e-9 * np.abs(force).max():
+        force = known_force(log, a)
+        if not varies(force):
             raise LogError(
-                f"expected force that varies along axis {axis} to score against, found {force[0]:.4g} N throughout; "
+                f"expected force that varies along axis {axis} to {purpose}, found {force[0]:.4g} N throughout; "
                 f"drop {axis} from log.axes, or give a log with contact"
             )
 
 
-def _scores(posterior: Posterior, training: PreparedLog, axis: int) -> Scores:
-    marginal = posterior[Latent.FORCE]
-    force = np.concatenate(
-        [trial.force[:, axis] for trial in posterior.log.trials if trial.force is not None]
-    )
-    trained = np.concatenate([trial.force[:, axis] for trial in training.trials if trial.force is not None])
-    return score(marginal.mean[:, axis], marginal.sd[:, axis], force, trained)
+def _question_training(name: str, model: ImpedanceModel, training: PreparedLog, log: PreparedLog) -> None:
+    """Warn of a model that knows the tested trials, or was trained on others than the one it is compared with."""
+    seen = {trial_key(trial) for trial in model.fitted.log.trials}
+    if any(trial_key(trial) in seen for trial in log.trials):
+        found = (
+            "some of these trials were trained on, so their"
+            if name == IMPEDANCE
+            else f"{name} was trained on some of these trials, so its"
+        )
+        warnings.warn(
+            f"{found} scores tell how well they are remembered, not predicted", LogWarning, stacklevel=3
+        )
+    if seen != {trial_key(trial) for trial in training.trials}:
+        warnings.warn(
+            f"{name} was trained on other trials than the model it is compared with, so scores tell of the data too",
+            LogWarning,
+            stacklevel=3,
+        )

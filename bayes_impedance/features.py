@@ -97,17 +97,26 @@ class FeatureMap:
         return names
 
     def __call__(
-        self, log: PreparedLog, mean: TrajectoryMean, trial_labels: Mapping[str, int] | None = None
+        self,
+        log: PreparedLog,
+        mean: TrajectoryMean,
+        trial_labels: Mapping[str, int] | None = None,
+        *,
+        observed: bool = False,
     ) -> Features:
-        """Inputs of every sample of `log`; trials with equal label share what trials do not share otherwise.
+        """Inputs of the samples of `log`; trials with equal label share what trials do not share otherwise.
 
-        `trial_labels` maps `trial_key` to a label, so that two logs can be put into one covariance.
+        `trial_labels` maps `trial_key` to a label, so that two logs can be put into one covariance; `observed` leaves
+        out samples without known force, which cannot be conditioned on.
         """
         labels = trial_labels or label_trials(log)
         blocks = [self._trial(trial, mean, labels[trial_key(trial)]) for trial in log.trials]
         groups = log.groups
         members = [[i for i, trial in enumerate(log.trials) if trial.group == group] for group in groups]
-        lengths = [sum(len(log.trials[i].time) for i in member) for member in members]
+        chosen = [
+            np.flatnonzero(trial.observed) if observed else np.arange(trial.n_samples) for trial in log.trials
+        ]
+        lengths = [sum(len(chosen[i]) for i in member) for member in members]
         n, a = max(lengths), len(self.axes)
         has_force = all(trial.force is not None for trial in log.trials)
         inputs = np.zeros((a, len(groups), n, self.width))
@@ -116,12 +125,13 @@ class FeatureMap:
         valid = np.zeros((len(groups), n), dtype=bool)
         rows = []
         for g, (member, length) in enumerate(zip(members, lengths, strict=True)):
-            inputs[:, g, :length] = np.concatenate([blocks[i][0] for i in member], axis=1)
-            means[:, g, :length] = np.concatenate([blocks[i][1] for i in member], axis=1)
+            inputs[:, g, :length] = np.concatenate([blocks[i][0][:, chosen[i]] for i in member], axis=1)
+            means[:, g, :length] = np.concatenate([blocks[i][1][:, chosen[i]] for i in member], axis=1)
             if has_force:
-                force[:, g, :length] = np.concatenate([log.trials[i].force for i in member]).T
+                known = [values[chosen[i]] for i in member if (values := log.trials[i].force) is not None]
+                force[:, g, :length] = np.concatenate(known).T
             valid[g, :length] = True
-            rows.append(np.concatenate([_row_index(i, len(log.trials[i].time)) for i in member]))
+            rows.append(np.concatenate([_row_index(i, chosen[i]) for i in member]))
         return Features(
             groups=groups,
             inputs=torch.from_numpy(inputs),
@@ -244,5 +254,5 @@ def _residual_input(model: ModelConfig) -> tuple[Component, ...]:
     return () if model.residual is None else model.residual.input
 
 
-def _row_index(trial: int, n: int) -> NDArray[np.int64]:
-    return np.stack([np.full(n, trial), np.arange(n)], axis=1)
+def _row_index(trial: int, samples: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.stack([np.full(len(samples), trial), samples], axis=1)

@@ -111,7 +111,7 @@ class ImpedanceModel:
         """
         prepared = ImpedanceModel(self.config).prepare(log)
         feature_map = FeatureMap(self.config, prepared.axes)
-        features = feature_map(prepared, self._mean(prepared))
+        features = feature_map(prepared, self._mean(prepared), observed=True)
         if features.force is None:
             raise LogError("expected a log with force to train on, found none; name log.columns.force")
         self._check_capacity(prepared)
@@ -142,7 +142,7 @@ class ImpedanceModel:
         labels = label_trials(*([prepared] if evidence is None else [prepared, evidence]))
         if evidence is not None:
             self._check_capacity(evidence)
-            conditions = feature_map(evidence, mean, labels)
+            conditions = feature_map(evidence, mean, labels, observed=True)
         return compute_posterior(
             self._force_model(feature_map),
             prepared,
@@ -167,7 +167,7 @@ class ImpedanceModel:
                 f"axis {axis!r} and group {group!r}"
             )
         feature_map = FeatureMap(self.config, log.axes)
-        features = feature_map(log, self._mean(log))
+        features = feature_map(log, self._mean(log), observed=True)
         a, g = log.axes.index(axis), features.groups.index(group)
         n = len(features.rows[g])
         model = self._force_model(feature_map)
@@ -186,7 +186,7 @@ class ImpedanceModel:
         prepared = self.prepare(log)
         self._check_capacity(prepared)
         feature_map = FeatureMap(self.config, prepared.axes)
-        features = feature_map(prepared, self._mean(prepared))
+        features = feature_map(prepared, self._mean(prepared), observed=True)
         if features.force is None:
             raise LogError("expected a log with force, found none; name log.columns.force")
         model = self._force_model(feature_map)
@@ -248,5 +248,5 @@ class ImpedanceModel:
 
     def _check_capacity(self, log: PreparedLog) -> None:
         for group in log.groups:
-            n = sum(len(trial.time) for trial in log.trials if trial.group == group)
+            n = sum(int(trial.observed.sum()) for trial in log.trials if trial.group == group)
             check_capacity(n, self.config.engine.max_samples, f"group '{group}'")

@@ -45,6 +45,7 @@ class PreparedTrial:
     `time (n,)` [s]; `(n, a)`: `position`, `reference` [m], `velocity`, `reference_velocity` [m/s],
     `acceleration`, `reference_acceleration` [m/s²], `jerk` [m/s³], `force`, `perturbation` [N]; `(n,)`:
     `repetition`, `phase` [1], `phase_velocity` [1/s], `phase_acceleration` [1/s²]; `truth` `(n,)` [SI] each.
+    Force is NaN at samples where it is not known: nothing is conditioned on there.
     """
 
     name: str
@@ -81,6 +82,13 @@ class PreparedTrial:
     def n_samples(self) -> int:
         """Number of samples."""
         return len(self.time)
+
+    @property
+    def observed(self) -> npt.NDArray[np.bool_]:
+        """Samples whose force is known, `(n,)`."""
+        if self.force is None:
+            return np.zeros(self.n_samples, dtype=bool)
+        return np.asarray(np.isfinite(self.force).all(axis=1))
 
     def __repr__(self) -> str:
         """Name, group, source and size."""

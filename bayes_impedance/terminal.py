@@ -7,6 +7,7 @@ from contextlib import contextmanager
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -136,15 +137,33 @@ def _values(values: Sequence[float]) -> str:
     return " ".join(f"{value:.2f}" for value in values)
 
 
-def evaluation_table(evaluation: Evaluation) -> Table:
-    """Scores by axis and model."""
-    table = Table(title="Predicted force, given the training forces only", title_justify="left")
-    for name in ("axis", "model", "SMSE", "MSLL", "NLPD", "coverage of 90 % band", "samples"):
+def evaluation_table(
+    evaluation: Evaluation, title: str = "Predicted force, given the training forces only"
+) -> Table:
+    """Scores by axis and model, the best of each axis in bold, and the share of force that impedance explains."""
+    table = Table(title=title, title_justify="left")
+    headings = ("SMSE", "MSLL", "NLPD", "coverage of 90 % band", "samples", "share of impedance")
+    for name in ("axis", "model", *headings):
         table.add_column(name, justify="left" if name in ("axis", "model") else "right")
-    for axis, models in evaluation.items():
+    for axis, models in evaluation.scores.items():
+        best = {score: min(getattr(s, score) for s in models.values()) for score in ("smse", "msll", "nlpd")}
         for name, s in models.items():
+            losses = [
+                _emphasised(f"{value:.{digits}f}", len(models) > 1 and value == best[score])
+                for score, value, digits in (("smse", s.smse, 4), ("msll", s.msll, 3), ("nlpd", s.nlpd, 3))
+            ]
+            share = evaluation.impedance_share[axis].get(name)
             table.add_row(
-                axis, name, f"{s.smse:.4f}", f"{s.msll:.3f}", f"{s.nlpd:.3f}", f"{s.coverage90:.3f}", str(s.n)
+                axis,
+                escape(name),
+                *losses,
+                f"{s.coverage90:.3f}",
+                str(s.n),
+                "" if share is None else f"{share:.3f}",
             )
         table.add_section()
     return table
+
+
+def _emphasised(text: str, emphasis: bool) -> str:
+    return f"[bold]{text}[/bold]" if emphasis else text

@@ -69,7 +69,7 @@ def demo() -> Results:
         recording = record(Path(folder), seed=0)
         model = ImpedanceModel(recording.config).fit(read_log(recording.training, recording.config.log))
         test = read_log(recording.testing, recording.config.log)
-        scores = as_json(evaluate(model, test, naive=True))
+        scores = as_json(evaluate(model, test, ["naive"]))
     posterior = model.posterior(model.fitted.log)
     errors = truth_errors(lambda name: posterior[name].mean, model.fitted.log)
     return {"seed": 0, "mean_relative_error": errors, "scores": scores}

@@ -61,6 +61,9 @@ class Bench:
             out or self.folder / "out.csv",
         ]
 
+    def evaluate(self, *arguments: object) -> Arguments:
+        return ["evaluate", self.trained, *arguments, "--json", self.folder / "out.json"]
+
     def model(self) -> Path:
         """A model folder to spoil."""
         return Path(shutil.copytree(self.trained, self.folder / "model"))
@@ -462,6 +465,58 @@ CASES: dict[str, tuple[Callable[[Bench], Arguments], tuple[str, ...]]] = {
             r"model.config\.yaml: expected the content that training wrote",
             r"found it changed; restore it, or train again",
         ),
+    ),
+    # --- comparisons
+    "nothing to score on": (
+        lambda bench: bench.evaluate(),
+        ("expected a LOG to score on, found none; name one, or cross-validate .* with --folds",),
+    ),
+    "unknown competitor": (
+        lambda bench: bench.evaluate(bench.other, "--against", "fase"),
+        (
+            "--against: expected a model folder, a YAML file or the name of a shipped configuration, found none",
+            "at 'fase'; shipped are phase, ",
+        ),
+    ),
+    "competitor that is no model folder": (
+        lambda bench: bench.evaluate(bench.other, "--against", bench.folder),
+        (r"expected a model folder with metadata\.json, found none",),
+    ),
+    "competitor with another smoother": (
+        lambda bench: bench.evaluate(bench.other, "--against", "phase"),
+        (
+            r"phase: expected the same preprocessing\.smoother as the model that it is compared with "
+            r"\(\{window: 0\.14, polynomial_order: 4\}\)",
+            "got {window: 0.1, polynomial_order: 4}; set it alike",
+        ),
+    ),
+    "competitor in a broken file": (
+        lambda bench: bench.evaluate("--folds", "trials", "--against", bench.text("model: [", "mine.yaml")),
+        (r"mine\.yaml: expected YAML, got: ",),
+    ),
+    "competitor that would take a baseline's name": (
+        lambda bench: bench.evaluate(bench.other, "--against", bench.text("", "naive.yaml")),
+        ("expected names other than impedance, naive, .*, got 'naive'; rename that model",),
+    ),
+    "one trial to cross-validate on": (
+        lambda bench: bench.evaluate(bench.other, "--folds", "trials"),
+        (r"other\.csv, trial 2: expected at least two trials to leave one out, found one; give more recordings",),
+    ),
+    "group of a single trial": (
+        lambda bench: bench.evaluate(
+            bench.log, bench.write(bench.table().query("trial == 0").assign(group="left")), "--folds", "trials"
+        ),
+        (r"bad\.csv, trial 0: expected at least two trials in group 'left' to leave one out, .* found one; give",),
+    ),
+    "folds without force": (
+        lambda bench: bench.evaluate(
+            bench.write(bench.table().drop(columns=["force_x", "force_y"])), "--folds", "last-third"
+        ),
+        (r"bad\.csv: expected column 'force_x'", r"set log\.columns\.force"),
+    ),
+    "trial too short for a last third": (
+        lambda bench: bench.evaluate(bench.write(bench.table().iloc[:8]), "--folds", "last-third"),
+        (r"bad\.csv, trial 0: expected samples before its last third and one window .* a trial of 2 samples; leave",),
     ),
     # --- outputs
     "posterior of another format": (

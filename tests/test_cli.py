@@ -16,8 +16,9 @@ import pytest
 
 from bayes_impedance import cli, demo, terminal, training
 from bayes_impedance.baselines import naive
-from bayes_impedance.config import load_config
-from bayes_impedance.persistence import load_model
+from bayes_impedance.config import dump_config, load_config
+from bayes_impedance.model import ImpedanceModel
+from bayes_impedance.persistence import load_model, save_model
 from bayes_impedance.posterior import UNITS
 from bayes_impedance.readers import read_log
 
@@ -48,13 +49,13 @@ def wide_terminal(monkeypatch):
 
 @pytest.fixture
 def interrupting(monkeypatch):
-    """Function that lets Ctrl-C come with the n-th progress of a training."""
+    """Function that lets Ctrl-C come with the n-th progress of all trainings together."""
 
     def install(after: int) -> None:
+        seen = 0
+
         @contextmanager
         def progress(*_: object):
-            seen = 0
-
             def hook(restart: int, iteration: int, objective: float) -> None:
                 nonlocal seen
                 seen += 1
@@ -205,6 +206,75 @@ def test_evaluate_without_baseline_and_on_training_data(command, tiny, tmp_path)
     )
 
 
+def test_evaluate_puts_several_models_in_one_table(command, tiny, tmp_path):
+    config = tmp_path / "bare.yaml"
+    bare = tiny.config.model_copy(update={"model": tiny.config.model.model_copy(update={"residual": None})})
+    config.write_text(dump_config(bare), encoding="utf-8")
+    (tmp_path / "elsewhere").mkdir()
+    for place in (tmp_path / "bare", tmp_path / "elsewhere" / "bare"):
+        save_model(ImpedanceModel(bare).fit(tiny.fitted.fitted.log), place)
+    others = [config, tmp_path / "bare", tmp_path / "elsewhere" / "bare"]
+    arguments = [part for other in others for part in ("--against", other)]
+    arguments += ["--baseline", "without-residual", "--baseline", "naive", "--json", tmp_path / "s.json"]
+    done = command("evaluate", tiny.model, tiny.other, *arguments)
+    assert (done.code, done.err) == (0, "")
+    content = json.loads((tmp_path / "s.json").read_text())
+    assert list(content) == ["axes"]
+    for axis in "xy":
+        rows = content["axes"][axis]
+        assert list(rows) == [
+            "impedance",
+            "impedance_without_residual",
+            "naive",
+            "bare",
+            "bare (2)",
+            "bare (3)",
+        ]
+        # Trained here or before, on the same log.
+        assert rows["bare"] == rows["bare (2)"] == rows["bare (3)"] == rows["impedance_without_residual"]
+        for name, values in rows.items():
+            share = r"\s+(0\.\d{3})? │" if name != "naive" else r"\s+│"
+            row = rf"│ {axis}\s+│ {re.escape(name)}\s+│\s+{values['smse']:.4f} │.*│\s+20 │{share}"
+            assert re.search(row, done.out), row
+    assert "share of impedance" in done.out
+
+
+@pytest.mark.parametrize("logs", [True, False])
+def test_evaluate_cross_validates(command, tiny, tmp_path, logs):
+    """Over the trials of LOG, or without one those of the training log."""
+    file = tmp_path / "scores.json"
+    given = [tiny.log, tiny.other] if logs else []
+    done = command("evaluate", tiny.model, *given, "--folds", "trials", "--baseline", "naive", "--json", file)
+    assert (done.code, done.err) == (0, "")
+    content = json.loads(file.read_text())
+    sources = ["log.csv, trial 0", "log.csv, trial 1", "other.csv, trial 2"][: 3 if logs else 2]
+    assert [fold["held_out"] for fold in content["folds"]] == [[source] for source in sources]
+    assert f"Predicted force of each trial, left out in turn, {len(sources)} folds" in done.out
+    for axis in "xy":
+        assert list(content["axes"][axis]) == ["impedance", "naive"]
+        assert list(content["impedance_share"][axis]) == ["impedance"]
+        for values in content["axes"][axis].values():
+            assert values["n"] == 20 * len(sources)
+            assert f"{values['smse']:.4f}" in done.out
+        assert f"{content['impedance_share'][axis]['impedance']:.3f}" in done.out
+
+
+def test_evaluate_holds_out_last_thirds(command, tiny, tmp_path):
+    file = tmp_path / "scores.json"
+    done = command("evaluate", tiny.model, "--folds", "last-third", "--json", file)
+    assert done.code == 0
+    assert done.err.startswith("warning: ")
+    assert "phases that no training sample has" in done.err
+    assert done.err.count("\n") == 1
+    assert "Predicted force of the last third of each trial, 1 fold " in done.out
+    (fold,) = json.loads(file.read_text())["folds"]
+    assert [held_out.split(", from ")[0] for held_out in fold["held_out"]] == [
+        "log.csv, trial 0",
+        "log.csv, trial 1",
+    ]
+    assert fold["axes"]["x"]["impedance"]["n"] == 12
+
+
 def test_show(command, tiny):
     done = command("show", tiny.model)
     assert (done.code, done.err) == (0, "")
@@ -302,7 +372,20 @@ def test_demo_does_not_touch_a_folder_of_somebody_else(command, tmp_path, monkey
             ),
         ),
         ("infer", ("MODEL", "LOG", "--out", "--given", "both", "training", "log", "--figures", ".parquet")),
-        ("evaluate", ("MODEL", "LOG", "--baseline", "naive", "--json")),
+        (
+            "evaluate",
+            (
+                "MODEL",
+                "LOG",
+                "--baseline",
+                "naive",
+                "without-residual",
+                "--against",
+                "--folds",
+                "last-third",
+                "--json",
+            ),
+        ),
         ("show", ("MODEL", "--json")),
     ],
 )
@@ -334,6 +417,7 @@ def test_version(command):
         (("train", "log.csv", "--config", "time", "--out", "m", "--fast"), "No such option"),
         (("infer", "model", "log.csv", "--out", "p.csv", "--given", "nothing"), "is not one of"),
         (("evaluate", "model", "log.csv", "--baseline", "ensemble"), "is not|Choose from"),
+        (("evaluate", "model", "--folds", "thirds"), "is not one of"),
         (("demo", "--seed", "-1"), "Invalid value for '--seed'"),
     ],
 )
@@ -433,6 +517,15 @@ def test_ctrl_c_while_the_baseline_trains_gives_no_scores(command, tiny, tmp_pat
     assert list(tmp_path.iterdir()) == []
     assert naive.NaiveModel.__doc__ is not None
     assert "the same care" in naive.NaiveModel.__doc__
+
+
+@pytest.mark.parametrize("after", [1, 4, 9])
+def test_ctrl_c_in_any_fold_gives_no_scores(command, tiny, tmp_path, interrupting, after):
+    interrupting(after)
+    file = tmp_path / "s.json"
+    done = command("evaluate", tiny.model, "--folds", "trials", "--baseline", "naive", "--json", file)
+    assert (done.code, done.out, done.err) == (130, "", "interrupted; no file was left half written\n")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_ctrl_c_on_a_terminal(tiny, tmp_path):

@@ -1,6 +1,7 @@
 """Scores: pooled over trials, from the training forces alone, beside a naive GP that gpytorch agrees with."""
 
 import json
+from contextlib import contextmanager
 from dataclasses import replace
 
 import gpytorch
@@ -11,9 +12,10 @@ import torch
 from scipy.stats import norm
 
 from bayes_impedance.baselines.naive import NaiveModel, naive_config
-from bayes_impedance.config import load_config
-from bayes_impedance.errors import LogError, LogWarning
+from bayes_impedance.config import Config, load_config, parse_config
+from bayes_impedance.errors import ConfigurationError, LogError, LogWarning
 from bayes_impedance.evaluation import as_json, evaluate
+from bayes_impedance.explained import EXPLAINING, impedance_share
 from bayes_impedance.log import InteractionLog
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.preprocessing import PreparedLog
@@ -154,12 +156,18 @@ def test_no_warning_for_unseen_trials(tiny, other, recwarn):
 
 def test_json(tiny, other):
     seen = []
-    scores = evaluate(tiny.fitted, other, naive=True, progress=lambda *step: seen.append(step))
+
+    @contextmanager
+    def watch(config, what):
+        seen.append((config, what))
+        yield lambda *step: seen.append(step[:2])
+
+    scores = evaluate(tiny.fitted, other, ["naive"], progress=watch)
     content = json.loads(json.dumps(as_json(scores)))
     assert content == {
         "axes": {
             axis: {name: values.as_dict() for name, values in models.items()}
-            for axis, models in scores.items()
+            for axis, models in scores.scores.items()
         }
     }
     for axis in "xy":
@@ -167,7 +175,124 @@ def test_json(tiny, other):
         for values in content["axes"][axis].values():
             assert list(values) == ["smse", "msll", "nlpd", "coverage90", "n"]
     # The progress is that of the baseline's training.
-    assert [step[:2] for step in seen] == [(0, 1), (0, 2), (0, 3)]
+    assert seen == [(tiny.config.training, "naive"), (0, 1), (0, 2), (0, 3)]
+
+
+def changed(config: Config, *overrides: str) -> Config:
+    return parse_config(config.model_dump(mode="json"), overrides=overrides)
+
+
+@pytest.fixture(scope="module")
+def bare(tiny) -> ImpedanceModel:
+    """The tiny configuration without residual, not fitted."""
+    return ImpedanceModel(changed(tiny.config, "model.residual=null"))
+
+
+def test_without_residual_is_the_same_configuration_without_one(tiny, other, bare):
+    training = tiny.fitted.fitted.log
+    scores = evaluate(tiny.fitted, other, ["without-residual", "naive", "naive"])
+    expected = evaluate(bare.fit(training), other)
+    for axis in "xy":
+        assert list(scores[axis]) == ["impedance", "impedance_without_residual", "naive"]
+        assert scores[axis]["impedance_without_residual"] == expected[axis]["impedance"]
+        share = scores.impedance_share[axis]
+        assert list(share) == ["impedance", "impedance_without_residual"]
+        assert share["impedance_without_residual"] == expected.impedance_share[axis]["impedance"]
+    its_own = tiny.fitted.posterior(training, latents=EXPLAINING)
+    assert [scores.impedance_share[axis]["impedance"] for axis in "xy"] == impedance_share(its_own).tolist()
+
+
+def test_a_configuration_is_trained_and_a_fitted_model_counts_as_it_is(tiny, other, bare):
+    training = tiny.fitted.fitted.log
+    fitted = bare.fit(training)
+    scores = evaluate(tiny.fitted, other, against={"fitted": fitted, "config": bare})
+    for axis in "xy":
+        assert list(scores[axis]) == ["impedance", "fitted", "config"]
+        assert scores[axis]["config"] == scores[axis]["fitted"]
+        # One yardstick for the whole column.
+        rows = scores[axis]
+        difference = rows["fitted"].msll - rows["impedance"].msll
+        assert difference == pytest.approx(rows["fitted"].nlpd - rows["impedance"].nlpd)
+
+
+def test_a_competitor_with_other_training_is_questioned(tiny, other, bare):
+    better = bare.fit(PreparedLog(other.axes, (*tiny.fitted.fitted.log.trials, *other.trials)))
+    with pytest.warns(LogWarning) as caught:
+        evaluate(tiny.fitted, other, against={"better": better})
+    assert [str(warning.message).split(", so")[0] for warning in caught] == [
+        "better was trained on some of these trials",
+        "better was trained on other trials than the model it is compared with",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides", "message"),
+    [
+        (
+            "other",
+            ["preprocessing.rate=20"],
+            r"^other: expected the same preprocessing\.rate .* \(10\.0\), .*, got 20",
+        ),
+        (
+            "other",
+            ["preprocessing.smoother.window=0.2"],
+            r"same preprocessing\.smoother .* \(\{window: 0\.14, polynomial_order: 4\}\), .* got \{window: 0\.2, ",
+        ),
+        (
+            "other",
+            ["log.axes=[x]"],
+            r"^other: expected the same log\.axes .* \(null\), .*, got \['x'\]; set it alike$",
+        ),
+        (
+            "naive",
+            [],
+            "^against: expected names other than impedance, naive, .*, got 'naive'; rename that model",
+        ),
+        (
+            "impedance",
+            [],
+            "^against: expected names other than impedance, .*, got 'impedance'; rename that model",
+        ),
+    ],
+)
+def test_models_that_cannot_stand_in_the_same_table(tiny, other, name, overrides, message):
+    model = ImpedanceModel(changed(tiny.config, *overrides))
+    with pytest.raises(ConfigurationError, match=message):
+        evaluate(tiny.fitted, other, against={name: model})
+
+
+def test_fitted_competitor_on_other_axes(tiny, other):
+    motion = PreparedLog(("x",), tuple(one_axis(trial) for trial in tiny.fitted.fitted.log.trials))
+    with pytest.raises(
+        LogError, match="^expected a log with axes x, on which the model was trained, got x, y"
+    ):
+        evaluate(tiny.fitted, other, against={"other": ImpedanceModel(tiny.config).fit(motion)})
+
+
+def one_axis(trial):
+    arrays = {
+        name: value[:, :1]
+        for name in trial.__slots__
+        if isinstance(value := getattr(trial, name), np.ndarray) and value.ndim == 2
+    }
+    return replace(trial, **arrays)
+
+
+@pytest.mark.parametrize(
+    ("config", "baselines", "message"),
+    [
+        ([], ["ensemble"], "^baselines: expected some of naive, without-residual, got 'ensemble'; choose"),
+        (
+            ["model.residual=null"],
+            ["without-residual"],
+            "^baseline without-residual: .* found model.residual: null; leave",
+        ),
+    ],
+)
+def test_baselines_that_are_none(tiny, other, config, baselines, message):
+    model = ImpedanceModel(changed(tiny.config, *config)).fit(tiny.fitted.fitted.log)
+    with pytest.raises(ConfigurationError, match=message):
+        evaluate(model, other, baselines)
 
 
 def test_log_without_force(tiny):

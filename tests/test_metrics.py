@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from bayes_impedance.metrics import score
+from bayes_impedance.metrics import Prediction, pooled_score, score, varies
 
 
 def predictions(n: int = 200, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -57,6 +57,31 @@ def test_coverage_of_right_predictions_is_nominal() -> None:
     force = mean + sd * generator.standard_normal(n)
     coverage = score(mean, sd, force, force).coverage90
     assert abs(coverage - 0.9) < 4.0 * math.sqrt(0.9 * 0.1 / n)
+
+
+def test_pooled_scores_are_those_of_every_sample() -> None:
+    """Parts of different size; each has trivial predictions of its own."""
+    first, second = predictions(200, seed=0), predictions(50, seed=1)
+    pooled = pooled_score([Prediction(*first), Prediction(*second)])
+    each = [score(*first), score(*second)]
+    assert pooled.n == 250
+    for name in ("msll", "nlpd", "coverage90"):
+        expected = (200 * getattr(each[0], name) + 50 * getattr(each[1], name)) / 250
+        assert getattr(pooled, name) == pytest.approx(expected)
+    squares = sum(
+        scores.smse * np.var(part[2]) * scores.n for scores, part in zip(each, (first, second), strict=True)
+    )
+    assert pooled.smse == pytest.approx(squares / 250 / np.var(np.concatenate([first[2], second[2]])))
+
+
+@pytest.mark.parametrize("force", [np.zeros(5), np.full(5, 3.0), 3.0 + 1e-12 * np.arange(5)])
+def test_smse_is_undefined_where_force_does_not_vary(force: np.ndarray) -> None:
+    mean, sd, _, training = predictions(5)
+    assert not varies(force)
+    scores = score(mean, sd, force, training)
+    assert math.isnan(scores.smse)
+    assert math.isfinite(scores.msll)
+    assert varies(force + 1e-6 * np.arange(5))
 
 
 def test_scores_are_json_of_plain_numbers() -> None:

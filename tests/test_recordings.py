@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from bayes_impedance.config import load_config, parse_config
+from bayes_impedance.cross_validation import cross_validate
 from bayes_impedance.errors import LogWarning
+from bayes_impedance.folds import split
 from bayes_impedance.identifiability import Support, caveat
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.log import InteractionLog
@@ -80,6 +82,26 @@ def test_a_wrong_equilibrium_is_noticed(robot, misled):
     # 95 nats at the time of writing.
     assert right > wrong + 50
     assert residual_rms(misled) > 2 * residual_rms(robot)
+
+
+def test_an_impedance_predicts_the_last_third_of_a_push(robot, robot_log):
+    """The robot presses harder than it did before, where a naive GP knows nothing."""
+    result = cross_validate(ImpedanceModel(ROBOT), robot_log, "last-third", ["naive", "without-residual"])
+    scores = result["z"]
+    assert scores["impedance"].n == robot.report.samples // 3
+    assert scores["impedance"].smse < scores["naive"].smse / 100
+    assert scores["impedance"].nlpd < scores["impedance_without_residual"].nlpd < scores["naive"].nlpd - 1
+    # As good as a line through the first two thirds.
+    (trial,) = robot.fitted.log.trials
+    (beginning,) = split(robot.fitted.log, ROBOT, "last-third")[0].training.trials
+    slope, offset = np.polyfit(
+        (trial.reference - trial.position)[beginning.observed, 0], trial.force[beginning.observed, 0], 1
+    )
+    held_out = slice(-scores["impedance"].n, None)
+    predicted = slope * (trial.reference - trial.position)[held_out, 0] + offset
+    force = trial.force[held_out, 0]
+    assert scores["impedance"].smse < 1.1 * np.mean((force - predicted) ** 2) / np.var(force)
+    assert result.pooled.impedance_share["z"]["impedance"] == pytest.approx(1.0, abs=0.05)
 
 
 # --- a person pushing a robot, with nothing known of where to ------------------------------------

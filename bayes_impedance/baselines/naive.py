@@ -23,7 +23,7 @@ class NaiveModel:
         self._config = naive_config(config)
         self._log = log
         self._map = FeatureMap(self._config, log.axes)
-        features = self._map(log, self._mean(log))
+        features = self._map(log, self._mean(log), observed=True)
         if features.force is None:
             raise LogError("expected a log with force to train on, found none; name log.columns.force")
         self._model: ForceModel = build_naive_model(self._config, self._map)
@@ -38,7 +38,7 @@ class NaiveModel:
             self._model,
             log,
             self._map(log, self._mean(log), labels),
-            self._map(self._log, self._mean(self._log), labels),
+            self._map(self._log, self._mean(self._log), labels, observed=True),
             self._config.engine.jitter,
             [Latent.FORCE],
         )
