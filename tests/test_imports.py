@@ -27,7 +27,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             {"posterior"},
             {"identifiability", "baselines", "baselines.naive"},
             {"model"},
-            {"persistence", "evaluation"},
+            {"persistence", "evaluation", "sensitivity"},
             {"__init__"},
             {"simulation", "simulation.generative", "plotting", "terminal"},
             {"demo"},
