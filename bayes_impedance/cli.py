@@ -249,7 +249,7 @@ def show(
         typer.Option(
             "--sensitivity",
             help="Make every prior wider, narrower, higher and lower, and say which conclusions move: some 50 refits, "
-            "a minute at 400 samples, many at thousands.",
+            "about a minute at a few hundred samples, and growing with their cube.",
         ),
     ] = False,
 ) -> None:

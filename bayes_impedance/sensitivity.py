@@ -300,8 +300,10 @@ def _finding(pairs: Sequence[tuple[Change, Effect]], planned: int) -> str:
         return f"prior only, so it follows its priors: {listed}" if prior_only else f"rests on {listed}"
     change, effect = max(pairs, key=lambda pair: pair[1].shift)
     tried = f"all {planned}" if len(pairs) == planned else f"the {len(pairs)} fitted of {planned}"
-    said = f"robust to {tried} changes (largest {in_sds(effect.shift)}, by {change.label})"
-    return f"prior only, yet {said}" if prior_only else said
+    largest = f"(largest {in_sds(effect.shift)}, by {change.label})"
+    if prior_only:
+        return f"prior only, and so uncertain that {tried} changes stay within its interval {largest}"
+    return f"robust to {tried} changes {largest}"
 
 
 def _extent(effect: Effect) -> str:
