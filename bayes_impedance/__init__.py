@@ -1,7 +1,7 @@
 """Interaction forces between a person and a robot: arm impedance and intention by Gaussian processes.
 
-High level: `read_log`, `load_config`, `ImpedanceModel`, `evaluate`, `cross_validate`, `save_model`, `load_model`.
-Under it: `bayes_impedance.kernels`, ordinary gpytorch kernels to take into one's own code.
+High level: `read_log`, `load_config`, `ImpedanceModel`, `evaluate`, `cross_validate`, `prior_sensitivity`,
+`save_model`, `load_model`. Under it: `bayes_impedance.kernels`, ordinary gpytorch kernels to take into one's own code.
 """
 
 from bayes_impedance.config import Config as Config
@@ -19,3 +19,5 @@ from bayes_impedance.persistence import load_model as load_model
 from bayes_impedance.persistence import save_model as save_model
 from bayes_impedance.posterior import Posterior as Posterior
 from bayes_impedance.readers import read_log as read_log
+from bayes_impedance.sensitivity import Sensitivity as Sensitivity
+from bayes_impedance.sensitivity import prior_sensitivity as prior_sensitivity

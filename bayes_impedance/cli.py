@@ -32,6 +32,7 @@ from bayes_impedance.persistence import METADATA, load_model, save_model
 from bayes_impedance.plotting import plot_force, save_figure, save_figures
 from bayes_impedance.posterior import Posterior
 from bayes_impedance.readers import read_log
+from bayes_impedance.sensitivity import Sensitivity, prior_sensitivity
 
 BAD_INPUT, INTERRUPTED = 2, 130
 
@@ -301,13 +302,24 @@ def show(
     json_output: Annotated[
         bool, typer.Option("--json", help="Print estimates and verdicts as JSON.")
     ] = False,
+    sensitivity: Annotated[
+        bool,
+        typer.Option(
+            "--sensitivity",
+            help="Make every prior wider, narrower, higher and lower, and say which conclusions move: some 50 refits, "
+            "about a minute at a few hundred samples, and growing with their cube.",
+        ),
+    ] = False,
 ) -> None:
     """Show hyperparameters in SI units, prior against posterior, the verdict on impedance, and what trained them."""
     console = Console()
     trained = load_model(model)
     posterior = trained.posterior(trained.fitted.log)
     if json_output:
-        typer.echo(json.dumps(summarise(trained.verdicts(posterior)), indent=2))
+        shown: dict[str, Any] = dict(summarise(trained.verdicts(posterior)))
+        if sensitivity:
+            shown["sensitivity"] = _sensitivity(trained).as_json()
+        typer.echo(json.dumps(shown, indent=2))
         return
     log, report = trained.fitted.log, trained.report
     sources = ", ".join(dict.fromkeys(trial.source for trial in log.trials))
@@ -319,6 +331,14 @@ def show(
     console.print(terminal.hyperparameter_table(trained))
     console.print(terminal.restart_table(trained))
     terminal.print_verdicts(console, trained, posterior)
+    if sensitivity:
+        terminal.print_sensitivity(console, _sensitivity(trained))
+
+
+def _sensitivity(model: ImpedanceModel) -> Sensitivity:
+    # The bar is for people: standard output may be JSON.
+    with terminal.sensitivity_progress(_errors()) as progress:
+        return prior_sensitivity(model, progress)
 
 
 def _others(sources: Sequence[str]) -> dict[str, ImpedanceModel]:

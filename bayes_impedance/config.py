@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
@@ -30,6 +30,9 @@ ProfileName = Literal["squared_exponential", "rational_quadratic", "matern52", "
 #: (kurtosis 3 exp(4 s²)) that a Gaussian with the same two moments misleads.
 LARGEST_LOG_SD = 0.5
 
+#: Widest log-SD of a hyperprior.
+LARGEST_HYPERPRIOR_LOG_SD = 5.0
+
 #: What PyYAML raises at a text that it cannot turn into values (13 months, a thousand brackets).
 UNREADABLE = (yaml.YAMLError, ValueError, RecursionError)
 
@@ -48,7 +51,7 @@ class Hyperparameter(Section):
     """
 
     median: float = Field(gt=0)
-    log_sd: float = Field(default=1.0, gt=0, le=5)
+    log_sd: float = Field(default=1.0, gt=0, le=LARGEST_HYPERPRIOR_LOG_SD)
     fixed: bool = False
 
 
@@ -472,6 +475,14 @@ def _validate(content: Mapping[str, Any], where: str) -> Config:
         raise ConfigurationError(f"{where}: {' '.join(_explain(error).split())}") from error
 
 
+def replace_value(config: Config, key: str, value: Any) -> Config:
+    """`config` with another value at a dotted key.
+
+    Raises ConfigurationError as load_config does.
+    """
+    return _validate(_assign(config.model_dump(mode="json"), key.split("."), value), key)
+
+
 def dump_config(config: Config) -> str:
     """The whole configuration, defaults included, as YAML."""
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
@@ -487,6 +498,11 @@ def _override(content: dict[str, Any], assignment: str) -> dict[str, Any]:
         value = yaml.safe_load(text)
     except UNREADABLE as error:
         raise ConfigurationError(f"--set {key}: expected a YAML value, got {text!r}") from error
+    return _assign(content, parts, value)
+
+
+def _assign(content: dict[str, Any], parts: Sequence[str], value: Any) -> dict[str, Any]:
+    """`content` with `value` at the end of a path of keys."""
     level = content
     for part in parts[:-1]:
         # A section that is absent (null) opens up; an unknown one is refused by the validation that follows.

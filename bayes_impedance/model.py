@@ -103,8 +103,16 @@ class ImpedanceModel:
             )
         return prepared
 
-    def fit(self, log: InteractionLog | PreparedLog, progress: Progress | None = None) -> ImpedanceModel:
+    def fit(
+        self,
+        log: InteractionLog | PreparedLog,
+        progress: Progress | None = None,
+        start: ImpedanceModel | None = None,
+    ) -> ImpedanceModel:
         """A new model with hyperparameters trained on `log` (MAP of the marginal likelihood).
+
+        The first restart begins at the values of `start`, a fitted model with the same hyperparameters, where one is
+        given; such a refit has no Laplace approximation.
 
         Raises:
             LogError, ConfigurationError, TooManySamplesError, NotPositiveDefiniteError.
@@ -116,7 +124,12 @@ class ImpedanceModel:
             raise LogError("expected a log with force to train on, found none; name log.columns.force")
         self._check_capacity(prepared)
         force_model = build_force_model(self.config, feature_map)
-        report = train(force_model, features, self.config.training, self.config.engine.jitter, progress)
+        if start is not None:
+            force_model.start_at(start.hyperparameters)
+        warm = start is not None
+        report = train(
+            force_model, features, self.config.training, self.config.engine.jitter, progress, warm, laplace=not warm
+        )  # fmt: skip
         return ImpedanceModel(self.config, Fit(force_model, prepared, report))
 
     def posterior(

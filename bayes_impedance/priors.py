@@ -26,6 +26,7 @@ from bayes_impedance.config import (
     ImpedancePrior,
     LengthScales,
 )
+from bayes_impedance.errors import ConfigurationError
 from bayes_impedance.features import UNITS, FeatureMap, baseline_components, theta_components
 from bayes_impedance.kernels.impedance import ImpedanceKernel, InputLayout, InteractionKernel
 from bayes_impedance.kernels.stationary import StationaryKernel, log_positive
@@ -122,6 +123,25 @@ class ForceModel(gpytorch.Module):
     def entries(self) -> tuple[Entry, ...]:
         """Every hyperparameter, in the order in which it is shown."""
         return tuple(self._list_entries(self))
+
+    def start_at(self, entries: Sequence[Entry]) -> None:
+        """Learned hyperparameters take their values from `entries` of another model with the same ones.
+
+        Raises:
+            ConfigurationError: it has others, or another number of axes.
+        """
+        mine, others = (
+            ", ".join(f"{entry.name} {tuple(entry.raw.shape)}" for entry in listed)
+            for listed in (self.entries, entries)
+        )
+        if mine != others:
+            raise ConfigurationError(
+                f"expected a start with the hyperparameters (and shapes) {mine}, got {others}; start from a model of "
+                "the same structure"
+            )
+        for entry, other in zip(self.entries, entries, strict=True):
+            with torch.no_grad():
+                entry.raw.copy_(torch.where(entry.free, other.raw, entry.raw))
 
     def prior_mean(self, inputs: Tensor) -> Tensor:
         """E[u], `(axes, groups, n)` [N]."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -17,6 +18,8 @@ from bayes_impedance.identifiability import Support, Verdict, caveat, rounded
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.posterior import Posterior
 from bayes_impedance.priors import Entry
+from bayes_impedance.sensitivity import Effect, Refit, Sensitivity, in_sds
+from bayes_impedance.sensitivity import Progress as SensitivityHook
 from bayes_impedance.training import Progress as ProgressHook
 
 COLOURS = {Support.SUPPORTED: "green", Support.WEAK: "yellow", Support.PRIOR_ONLY: "red"}
@@ -39,6 +42,24 @@ def training_progress(console: Console, config: TrainingConfig, what: str) -> It
         yield hook
 
 
+@contextmanager
+def sensitivity_progress(console: Console) -> Iterator[SensitivityHook]:
+    """A bar over changes of priors; hidden where the output is no terminal."""
+    columns = (
+        TextColumn("prior sensitivity"),
+        BarColumn(),
+        TextColumn("{task.description}"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
+        task = bar.add_task("", total=None)
+
+        def hook(done: int, planned: int, change: str) -> None:
+            bar.update(task, completed=done, total=planned, description=f"{done + 1}/{planned} {change}")
+
+        yield hook
+
+
 def verdict_table(verdicts: Sequence[Verdict]) -> Table:
     """Path averages of stiffness, damping and mass, each beside its verdict."""
     table = Table(title="Impedance, averaged over the samples", title_justify="left")
@@ -51,9 +72,13 @@ def verdict_table(verdicts: Sequence[Verdict]) -> Table:
         table.add_row(
             f"{v.latent.value} {v.axis}{v.axis} [{v.unit}]".replace("[", "\\["), f"{v.mean:.4g}",
             f"{v.q05:.4g} … {v.q95:.4g}", f"{v.prior_q05:.3g} … {v.prior_q95:.3g}", rounded(v.contraction),
-            f"[{colour}]{v.support.name.lower().replace('_', ' ')}[/{colour}]",
+            f"[{colour}]{_short(v.support)}[/{colour}]",
         )  # fmt: skip
     return table
+
+
+def _short(support: Support) -> str:
+    return support.name.lower().replace("_", " ")
 
 
 def print_verdicts(console: Console, model: ImpedanceModel, posterior: Posterior) -> list[Verdict]:
@@ -167,3 +192,57 @@ def evaluation_table(
 
 def _emphasised(text: str, emphasis: bool) -> str:
     return f"[bold]{text}[/bold]" if emphasis else text
+
+
+def sensitivity_table(sensitivity: Sensitivity) -> Table:
+    """Changes of one prior that move a conclusion, or that could not be fitted; the largest shift first."""
+    table = Table(
+        title="Prior sensitivity: changes of one prior that move a conclusion", title_justify="left"
+    )
+    table.add_column("prior and its change", no_wrap=True)
+    table.add_column("conclusion")
+    table.add_column("median before → after")
+    table.add_column("shift", justify="right", no_wrap=True)
+    shown = [refit for refit in sensitivity.refits if refit.failure or any(e.moved for e in refit.effects)]
+    for refit in sorted(shown, key=_alarm, reverse=True):
+        unfinished = "" if refit.converged or refit.failure else "\n  (not converged)"
+        # Long keys take two lines, so that 80 columns hold the table.
+        key = re.sub(r"\.(length_scale\.)", r".\n  \1", refit.change.key)
+        change = f"{key}\n  {refit.change.description}{unfinished}"
+        cells = [_effect_cells(effect) for effect in refit.effects if effect.moved]
+        for row in cells or [("", f"no refit: {escape(refit.failure or '')}", "")]:
+            table.add_row(change, *row)
+            change = ""
+        table.add_section()
+    return table
+
+
+def _alarm(refit: Refit) -> tuple[float, float]:
+    """Largest shift of a conclusion that claims to be more than its prior, then of any."""
+    moved = [effect for effect in refit.effects if effect.moved]
+    carried = [effect.shift for effect in moved if effect.support is not Support.PRIOR_ONLY]
+    return max(carried, default=0.0), max((effect.shift for effect in moved), default=0.0)
+
+
+def _effect_cells(effect: Effect) -> tuple[str, str, str]:
+    values = f"{effect.before:.4g} → {effect.after:.4g} {effect.unit}"
+    if effect.support is None or effect.support_after is None:
+        values = f"by {effect.difference:.2g} {effect.unit} rms"
+    elif effect.reversed:
+        values += f" ({_short(effect.support)} → {_short(effect.support_after)})"
+    elif effect.support is Support.PRIOR_ONLY:
+        values += f" ({_short(effect.support)})"
+    # What only its prior knows moves with it: no news.
+    style = "dim" if effect.support is Support.PRIOR_ONLY else "yellow"
+    return effect.name, values, f"[{style}]{in_sds(effect.shift)}[/{style}]"
+
+
+def print_sensitivity(console: Console, sensitivity: Sensitivity) -> None:
+    """The table where something moves, then a sentence for each conclusion, then what limits them."""
+    table = sensitivity_table(sensitivity)
+    if table.row_count:
+        console.print(table)
+    for sentence in sensitivity.sentences:
+        console.print(f"  {sentence}", highlight=False)
+    for remark in sensitivity.remarks:
+        console.print(f"  {remark}", style="yellow", highlight=False)

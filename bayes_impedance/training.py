@@ -33,6 +33,7 @@ INTERVAL_BOUND = 8.0
 #: Relative improvement an iteration at which a restart has converged: 1e-5 of a hundred nats.
 RELATIVE_TOLERANCE = 1e-7
 HESSIAN_STEP = 1e-3
+NOTHING_FREE = "every hyperparameter is fixed"
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,11 @@ class RestartReport:
     evaluations: int
     seconds: float
     outcome: str
+
+    @property
+    def converged(self) -> bool:
+        """Whether the optimiser ended by its own tolerances, or had nothing to do."""
+        return self.outcome.startswith(("CONVERGENCE", NOTHING_FREE))
 
 
 @dataclass(frozen=True)
@@ -89,11 +95,13 @@ def train(
     jitter: float,
     progress: Progress | None = None,
     warm: bool = False,
+    laplace: bool = True,
 ) -> TrainingReport:
     """Set the hyperparameters of `model` to their MAP estimate; deterministic under `config.seed`.
 
     Restart 0 starts at the hyperprior medians or, when `warm`, where `model` stands; the others at draws from the
-    hyperprior. Interrupting (Ctrl-C) keeps the best found so far.
+    hyperprior. Interrupting (Ctrl-C) keeps the best found so far. Without `laplace` the report holds no `log_sd`, which
+    takes two evaluations a hyperparameter.
 
     Raises:
         NotPositiveDefiniteError: no restart found a covariance that factorises.
@@ -122,7 +130,7 @@ def train(
         raise KeyboardInterrupt
     search.restore()
     log_sd: dict[str, list[list[float]]] = {}
-    if not interrupted:
+    if laplace and not interrupted:
         try:
             log_sd = _laplace(search)
         except KeyboardInterrupt:
@@ -143,7 +151,7 @@ def _climb(search: _Search, start: Array, config: TrainingConfig) -> str:
     """One run of L-BFGS from `start`; how it ended."""
     if not start.size:
         search(start)
-        return "every hyperparameter is fixed"
+        return NOTHING_FREE
     result = minimize(  # type: ignore[call-overload] # the stubs know no bounds as a list of pairs with a callback
         search,
         start,

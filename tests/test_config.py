@@ -17,6 +17,7 @@ from bayes_impedance.config import (
     dump_config,
     load_config,
     parse_config,
+    replace_value,
     shipped_configurations,
 )
 from bayes_impedance.errors import ConfigurationError
@@ -214,6 +215,17 @@ def test_overrides_reach_into_null_sections():
     assert config.preprocessing.smoother.window == 0.2
     assert config.model.residual is not None
     assert config.model.residual.offset_sd == Hyperparameter(median=2)
+
+
+def test_a_value_is_replaced_and_nothing_else():
+    config = load_config("time")
+    changed = replace_value(config, "model.noise_sd", {"median": 0.7, "log_sd": 0.4})
+    assert changed.model.noise_sd == Hyperparameter(median=0.7, log_sd=0.4)
+    assert replace_value(changed, "model.noise_sd", config.model.noise_sd.model_dump()) == config
+    with pytest.raises(ConfigurationError, match=r"unknown key 'model\.noise'; did you mean 'noise_sd'"):
+        replace_value(config, "model.noise", 0.7)
+    with pytest.raises(ConfigurationError, match=r"^model\.stiffness\.log_sd: .*expected at most 0\.5"):
+        replace_value(config, "model.stiffness.log_sd", 0.7)
 
 
 def test_overrides_that_need_each_other_are_judged_together():

@@ -34,7 +34,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
                 "baselines.without_residual",
             },
             {"model"},
-            {"persistence", "contenders"},
+            {"persistence", "contenders", "sensitivity"},
             {"evaluation"},
             {"cross_validation"},
             {"__init__"},
