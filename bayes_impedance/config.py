@@ -18,10 +18,15 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from bayes_impedance.errors import ConfigurationError
 
+#: Axis of motion and force.
 Axis = Literal["x", "y", "z"]
+#: What a process may depend on.
 Component = Literal["time", "phase", "position", "velocity"]
+#: θ, what the desired trajectory depends on.
 TrajectoryInput = Literal["time", "phase", "position", "position_velocity"]
+#: Prior mean of the desired trajectory (docs/model.md §1).
 TrajectoryMean = Literal["equilibrium", "reference", "trial_average", "constant"]
+#: Covariance of the desired trajectory.
 ProfileName = Literal["squared_exponential", "rational_quadratic", "matern52", "matern72", "matern92"]
 
 #: Above this log-SD the product of a log-normal stiffness and a displacement is so heavy-tailed
@@ -62,6 +67,7 @@ def _number_means_fixed(value: Any) -> Any:
     return value
 
 
+#: A hyperparameter, for which a bare number may stand: a fixed value.
 Scale = Annotated[Hyperparameter, BeforeValidator(_number_means_fixed)]
 
 

@@ -150,7 +150,7 @@ def _percentage(contraction: float) -> str:
 
 
 def summarise(verdicts: Iterable[Verdict]) -> dict[str, dict[str, float | str]]:
-    """JSON-able mapping from `stiffness_xx` … to estimate, interval, contraction and verdict."""
+    """JSON-able mapping from stiffness_xx, damping_xx, … to estimate, interval, contraction and verdict."""
     return {
         f"{v.latent.value}_{v.axis}{v.axis}": {
             "mean": v.mean,

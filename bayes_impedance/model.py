@@ -24,6 +24,7 @@ from bayes_impedance.priors import Entry, ForceModel, build_force_model
 from bayes_impedance.training import Progress, TrainingReport, observations, train
 from bayes_impedance.trajectory_mean import TrajectoryMean
 
+#: Forces that a posterior conditions on: of the training log, of the log at hand, or of both.
 Given = Literal["both", "training", "log"]
 
 

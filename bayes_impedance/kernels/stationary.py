@@ -134,6 +134,7 @@ class Matern(Profile):
         return ProfileDerivatives(torch.exp(-z), (ratios[0], ratios[1], ratios[2], ratios[3], ratios[4]))
 
 
+#: Profiles by the name that configurations give them.
 PROFILES: dict[str, Profile] = {
     "squared_exponential": SquaredExponential(),
     "rational_quadratic": RationalQuadratic(),

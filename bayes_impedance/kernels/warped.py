@@ -17,6 +17,7 @@ from torch import Tensor
 
 from bayes_impedance.kernels.stationary import BatchedKernel, register_positive, set_positive
 
+#: Whether w itself is a Gaussian process, or its logarithm.
 Law = Literal["gaussian", "log_gaussian"]
 
 
