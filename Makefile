@@ -5,7 +5,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
-SOURCES := bayes_impedance tests benchmarks docs
+SOURCES := bayes_impedance tests benchmarks docs conftest.py
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test lint types format bench results docs hooks clean

@@ -365,7 +365,13 @@ def shipped_configurations() -> dict[str, Path]:
 def load_config(source: str | Path, overrides: Iterable[str] = ()) -> Config:
     """Configuration from a YAML file, or from the name of a shipped one, with KEY=VALUE overrides.
 
-    Raises ConfigurationError naming the file, the key and the nearest known key.
+    Example:
+        >>> config = load_config("phase", ["preprocessing.rate=50", "model.mass.level=1.2"])
+        >>> config.preprocessing.rate, config.model.mass.level.fixed
+        (50.0, True)
+
+    Raises:
+        ConfigurationError: names the file, the key and the nearest known key.
     """
     path = Path(source)
     if not path.is_file():
@@ -390,7 +396,14 @@ def load_config(source: str | Path, overrides: Iterable[str] = ()) -> Config:
 def parse_config(content: Any, where: str = "configuration", overrides: Iterable[str] = ()) -> Config:
     """Configuration from plain mappings; `where` is named in errors.
 
-    Raises ConfigurationError as load_config does.
+    Example:
+        >>> parse_config({"model": {"stifness": {"level": 300}}}, "arm.yaml")
+        Traceback (most recent call last):
+        ...
+        bayes_impedance.errors.ConfigurationError: arm.yaml: unknown key 'model.stifness'; did you mean 'stiffness'?
+
+    Raises:
+        ConfigurationError: as `load_config` does.
     """
     if not isinstance(content, Mapping):
         raise ConfigurationError(f"{where}: expected a mapping of sections, got {type(content).__name__}")

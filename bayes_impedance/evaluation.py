@@ -29,6 +29,15 @@ def evaluate(
 ) -> Evaluation:
     """Score the force of `log` predicted from the training forces alone; optionally train a naive GP beside.
 
+    Example:
+        >>> from bayes_impedance.simulation.generative import draw_force, repeated_motion
+        >>> model = ImpedanceModel.from_config("phase", ["training.restarts=1", "training.max_iterations=5"])
+        >>> motion = repeated_motion(repetitions=3, duration=2.0, rate=10.0, axes=("x",))
+        >>> log = draw_force(model.config, motion, seed=0)
+        >>> scores = evaluate(model.fit(log.select([0, 1])), log.select([2]))
+        >>> scores["x"]["impedance"].n
+        20
+
     Raises:
         LogError: the log has no force, or the same force throughout.
     """

@@ -78,7 +78,12 @@ def assess(posterior: Posterior, config: Config, repetitions: int) -> list[Verdi
 
 
 def classify(contraction: float) -> Support:
-    """Support from contraction: at least .75 supported, at least .25 weak, below that the prior."""
+    """Support from contraction: at least .75 supported, at least .25 weak, below that the prior.
+
+    Example:
+        >>> classify(0.8).value, classify(0.1).value
+        ('supported by these data', 'prior only')
+    """
     if contraction >= SUPPORTED:
         return Support.SUPPORTED
     return Support.WEAK if contraction >= WEAK else Support.PRIOR_ONLY
@@ -140,7 +145,12 @@ def caveat(verdicts: Iterable[Verdict], posterior: Posterior, config: Config) ->
 
 
 def rounded(contraction: float) -> str:
-    """Contraction with two digits, never rounded up to certainty."""
+    """Contraction with two digits, never rounded up to certainty.
+
+    Example:
+        >>> rounded(0.823), rounded(0.9999)
+        ('0.82', '> 0.99')
+    """
     return "> 0.99" if contraction > 0.99 else f"{contraction:.2f}"
 
 

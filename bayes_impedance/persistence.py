@@ -39,6 +39,15 @@ FILES = ("config.yaml", "hyperparameters.safetensors", "data.safetensors")
 def save_model(model: ImpedanceModel, folder: str | Path) -> None:
     """Write a fitted model to `folder`, whole or not at all; a model that was there is replaced.
 
+    Example:
+        >>> from bayes_impedance.simulation.generative import draw_force, repeated_motion
+        >>> model = ImpedanceModel.from_config("phase", ["training.restarts=1", "training.max_iterations=1"])
+        >>> log = draw_force(model.config, repeated_motion(repetitions=2, duration=2.0, rate=10.0), seed=0)
+        >>> model = model.fit(log)
+        >>> save_model(model, "model")
+        >>> sorted(path.suffix for path in Path("model").iterdir())
+        ['.json', '.safetensors', '.safetensors', '.yaml']
+
     Raises:
         OutputError: the folder cannot be written.
         ConfigurationError: the model is not fitted.
@@ -66,6 +75,16 @@ def save_model(model: ImpedanceModel, folder: str | Path) -> None:
 
 def load_model(folder: str | Path) -> ImpedanceModel:
     """The model that `save_model` wrote, predicting the same to the last bit.
+
+    Example:
+        >>> from bayes_impedance.simulation.generative import draw_force, repeated_motion
+        >>> model = ImpedanceModel.from_config("phase", ["training.restarts=1", "training.max_iterations=1"])
+        >>> log = draw_force(model.config, repeated_motion(repetitions=2, duration=2.0, rate=10.0), seed=0)
+        >>> model = model.fit(log)
+        >>> save_model(model, "model")
+        >>> before, after = (m.posterior(log)["force"].mean for m in (model, load_model("model")))
+        >>> bool((before == after).all())
+        True
 
     Raises:
         ModelFolderError: the folder is missing, incomplete, changed, or of a newer schema.

@@ -196,6 +196,14 @@ class StationaryKernel(BatchedKernel):
         sd_prior, lengthscale_prior, shape_prior: priors of the hyperparameters.
         sd_constraint, lengthscale_constraint: constraints; default positive, on a log scale.
 
+    Example:
+        >>> kernel = StationaryKernel("matern52").double()
+        >>> kernel.sd, kernel.lengthscale = 2.0, 0.3
+        >>> time = torch.linspace(0.0, 1.0, 5, dtype=torch.float64).unsqueeze(-1)
+        >>> covariance = kernel(time).to_dense()
+        >>> tuple(covariance.shape), round(covariance[0, 0].item(), 6)
+        ((5, 5), 4.0)
+
     Raises:
         ValueError: an unknown profile.
     """

@@ -82,17 +82,17 @@ class Links:
     def resolve(self, name: str, module: pdoc.doc.Module, namespace: str) -> Target | None:
         """Where `name` is documented, as the code at `namespace` in `module` would find it."""
         while namespace:
-            if module.get(f"{namespace}.{name}"):
+            if self._shows(module.modulename, f"{namespace}.{name}"):
                 return module.modulename, f"{namespace}.{name}"
             namespace = namespace.rpartition(".")[0]
-        if module.get(name):
+        if self._shows(module.modulename, name):
             return module.modulename, name
         if "." in name:
             for full in (name, f"{self.package}.{name}"):
                 if full in self.modules:
                     return full, ""
                 owner, _, member = full.rpartition(".")
-                if owner in self.modules and self.modules[owner].get(member):
+                if owner in self.modules and self._shows(owner, member):
                     return owner, member
         head, _, rest = name.partition(".")
         if head in module.obj.__dict__:
@@ -102,9 +102,7 @@ class Links:
             target = self._imported(head, self.modules[self.package]) or self._unique.get(head)
         if target is None or not rest:
             return target
-        return (
-            (target[0], f"{target[1]}.{rest}") if self._documents(target[0], f"{target[1]}.{rest}") else None
-        )
+        return (target[0], f"{target[1]}.{rest}") if self._shows(target[0], f"{target[1]}.{rest}") else None
 
     def _imported(self, name: str, module: pdoc.doc.Module) -> Target | None:
         """A class, function or described variable of another module that `module` has imported."""
@@ -112,19 +110,21 @@ class Links:
         if thing is None or inspect.ismodule(thing):
             return None
         origin = getattr(thing, "__module__", None)
-        if origin in self.modules and self._documents(origin, name):
+        if origin in self.modules and self._shows(origin, name):
             return origin, name
         return next(
             (
                 (other, name)
                 for other, page in self.modules.items()
-                if page.obj.__dict__.get(name) is thing and page.get(name)
+                if page.obj.__dict__.get(name) is thing and self._shows(other, name)
             ),
             None,
         )
 
-    def _documents(self, module: str, qualname: str) -> bool:
-        return self.modules[module].get(qualname) is not None
+    def _shows(self, module: str, qualname: str) -> bool:
+        """Whether a page has such an entry; what a class inherits from another library has none."""
+        doc = self.modules[module].get(qualname)
+        return doc is not None and doc.taken_from[0] in self.modules and not doc.name.startswith("_")
 
     def _reference(self, module: pdoc.doc.Module, namespace: str, code: str) -> str:
         """What stands in back-ticks, with a link where it names something; broken where it seems to and does not."""
