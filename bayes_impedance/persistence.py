@@ -1,9 +1,11 @@
 """A trained model as a folder: YAML, JSON and safetensors, no pickle; loading gives the same bits.
 
-config.yaml                   the whole configuration
-hyperparameters.safetensors   unconstrained hyperparameters, by name
-data.safetensors              the prepared training log
-metadata.json                 schema and package version, training report, fingerprints
+The folder holds
+
+    config.yaml                   the whole configuration
+    hyperparameters.safetensors   unconstrained hyperparameters, by name
+    data.safetensors              the prepared training log
+    metadata.json                 schema and package version, training report, fingerprints
 """
 
 from __future__ import annotations

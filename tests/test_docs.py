@@ -23,6 +23,10 @@ SOURCES = {
     if path.name != "__main__.py"
 }
 ERRORS = {name for name in vars(errors) if name.endswith("Error")}
+#: What a page shows of the source, with a number at each line.
+SOURCE_CODE = re.compile(
+    r'<div class="pdoc-code codehilite"><pre><span></span><span id=.*?</pre>', flags=re.DOTALL
+)
 #: Special methods that a page may show.
 SHOWN = {"__init__", "__getitem__", "__call__"}
 
@@ -38,14 +42,7 @@ class Page(HTMLParser):
         self.preformatted = ""
         self._open: list[str] = []
         content = path.read_text(encoding="utf-8")
-        self.feed(
-            re.sub(
-                r'<div class="pdoc-code codehilite"><pre><span></span><span id=.*?</pre>',
-                "<div>",
-                content,
-                flags=re.S,
-            )
-        )
+        self.feed(SOURCE_CODE.sub("<div>", content))
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         attributes = dict(attrs)
@@ -109,15 +106,15 @@ def test_every_public_module_has_a_page(reference: Reference) -> None:
 
 @pytest.mark.parametrize("package", [name for name, path in SOURCES.items() if path.name == "__init__.py"])
 def test_a_package_lists_what_it_offers_by_name(reference: Reference, package: str) -> None:
-    aliases = [
-        (node.module, alias.name)
+    names = [
+        alias.name
         for node in ast.parse(SOURCES[package].read_text(encoding="utf-8")).body
         if isinstance(node, ast.ImportFrom)
         for alias in node.names
         if alias.asname == alias.name
     ]
     links = reference.page_of(package).links
-    for name in [alias[1] for alias in aliases]:
+    for name in names:
         assert [link for link in links if link.endswith(f"#{name}")], name
 
 
@@ -137,6 +134,14 @@ def test_formulas_are_preformatted_and_reachable_from_every_page(reference: Refe
         path = reference.folder / f"{module.replace('.', '/')}.html"
         targets = [(path.parent / link.partition("#")[0]).resolve() for link in reference.page(path).links]
         assert formulas in targets, module
+
+
+def test_aligned_text_is_preformatted(reference: Reference) -> None:
+    for path in reference.folder.rglob("*.html"):
+        content = path.read_text(encoding="utf-8")
+        for shown in re.findall(r'<div class="docstring">(.*?)</div>', content, re.DOTALL):
+            prose = re.sub(r"<pre>.*?</pre>", "", shown, flags=re.DOTALL)
+            assert not re.search(r"\S {3,}\S|<blockquote", prose), f"{path.name}: {prose}"
 
 
 def test_internal_links_resolve(reference: Reference) -> None:
@@ -176,7 +181,7 @@ def test_a_broken_reference_fails_the_build_and_writes_nothing(tmp_path: Path) -
     package = tmp_path / "bayes_impedance"
     package.mkdir()
     whole = ["`Arm.stiffness`", "`LIMIT`", "ValueError", "docs/model.md §2", "`(n, axes)`", "`best[a]`"]
-    broken = ["`Arn`", "`stifness`", "`Arm.stiffnes`", "MissingError", "docs/model.md §99"]
+    broken = ["`Arn`", "`stifness`", "`Arm.best`", "MissingError", "docs/model.md §99"]
     (package / "__init__.py").write_text(
         f'"""{", ".join(whole + broken)}."""\n\n#: A limit.\nLIMIT = 1\nbest = []\n\n\n'
         'class Arm:\n    """Of a person."""\n\n    stiffness = 1.0\n',

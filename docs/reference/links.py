@@ -17,7 +17,7 @@ from pdoc.render_helpers import relative_link
 
 NAME = r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*"
 #: A name, perhaps called, indexed or followed by its shape: `FeatureMap(config, axes)`, `best[a]`, `time (n,)`.
-REFERENCE = re.compile(rf"({NAME})( ?[(\[].*)?", flags=re.DOTALL)
+REFERENCE = re.compile(rf"({NAME})(\s?[(\[].*)?", flags=re.DOTALL)
 #: What is looked at in the HTML of a docstring; blocks of code and links that stand already pass by.
 DOCSTRING = re.compile(
     r"(?P<skip><pre>.*?</pre>|<a .*?</a>)"
@@ -109,7 +109,7 @@ class Links:
         thing = module.obj.__dict__.get(name)
         if thing is None or inspect.ismodule(thing):
             return None
-        origin = getattr(thing, "__module__", None)
+        origin = str(getattr(thing, "__module__", None))
         if origin in self.modules and self._shows(origin, name):
             return origin, name
         return next(
@@ -133,11 +133,19 @@ class Links:
             return code
         target = self.resolve(match[1], module, namespace)
         if target is None:
-            words = {match[1], *match[1].split(".")} & self._vocabulary
-            if match[1] not in words and len(words) < len(match[1].split(".")):
+            if not self._is_known(match[1], module, namespace):
                 self._report(module, namespace, match[1])
             return code
         return self._link(module, target, match[1]) + html.escape(match[2] or "")
+
+    def _is_known(self, name: str, module: pdoc.doc.Module, namespace: str) -> bool:
+        """Whether a name without an entry of its own means something: a column, a key, a file, an attribute."""
+        head, _, rest = name.partition(".")
+        target = self.resolve(head, module, namespace) if rest else None
+        owner = None if target is None else self.modules[target[0]].get(target[1])
+        if isinstance(owner, pdoc.doc.Class):
+            return hasattr(owner.obj, rest)
+        return name in self._vocabulary or self._vocabulary.issuperset(name.split("."))
 
     @staticmethod
     def _is_parameter(name: str, module: pdoc.doc.Module, namespace: str) -> bool:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import ast
-import dataclasses
 import inspect
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import Enum
@@ -98,38 +96,45 @@ def _described(source: str) -> dict[str, tuple[str, Written]]:
     lines = source.splitlines()
     described = {}
     for node in ast.parse(source).body:
-        target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
-        if not isinstance(target, ast.Name) or node.value is None:
-            continue
+        match node:
+            case ast.Assign(targets=[ast.Name(id=name)], value=value):
+                pass
+            case ast.AnnAssign(target=ast.Name(id=name), value=ast.expr() as value):
+                pass
+            case _:
+                continue
         first = node.lineno - 1
         while lines[first - 1].startswith("#:"):
             first -= 1
         comment = " ".join(line.removeprefix("#:").strip() for line in lines[first : node.lineno - 1])
         if comment:
-            value = written(ast.unparse(node.value))
-            described[target.id] = (comment, Written(re.sub(r"\s+", " ", value)))
+            described[name] = (comment, written(ast.unparse(value)))
     return described
 
 
 def _present_class(shown: pdoc.doc.Class) -> None:
-    if issubclass(shown.obj, BaseModel):
-        for name, info in shown.obj.model_fields.items():
-            _present_field(shown.members[name], info)
-    elif issubclass(shown.obj, Enum):
-        for item in shown.obj:
-            shown.members[item.name].default_value = item.value
-    elif issubclass(shown.obj, tuple):
+    kind: Any = shown.obj
+    members: dict[str, Any] = shown.members
+    if issubclass(kind, BaseModel):
+        for name, info in kind.model_fields.items():
+            _present_field(members[name], info)
+    elif issubclass(kind, Enum):
+        for item in kind:
+            members[item.name].default_value = item.value
+    elif issubclass(kind, tuple):
         # What NamedTuple says of its fields, "Alias for field number 0", tells nobody anything.
-        for name in ("__init__", *shown.obj._fields):
-            shown.members[name].docstring = ""
+        for name in ("__init__", *kind._fields):
+            members[name].docstring = ""
 
 
-def _present_field(variable: pdoc.doc.Variable, info: FieldInfo) -> None:
+def _present_field(variable: Any, info: FieldInfo) -> None:
     allowed = ["required"] if info.is_required() else []
     for constraint in info.metadata:
-        if dataclasses.is_dataclass(constraint):
-            values = dataclasses.asdict(constraint).items()
-            allowed += [f"{CONSTRAINTS[key]} {value}" for key, value in values if key in CONSTRAINTS]
+        allowed += [
+            f"{sign} {getattr(constraint, key)}"
+            for key, sign in CONSTRAINTS.items()
+            if hasattr(constraint, key)
+        ]
     if allowed:
         variable.annotation = Written(f"{variable.annotation} ({', '.join(allowed)})")
     default = info.default
