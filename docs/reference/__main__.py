@@ -6,6 +6,7 @@ links. Whatever warns fails the build, a name in back-ticks that the package doe
 
 from __future__ import annotations
 
+import shutil
 import sys
 import warnings
 from pathlib import Path
@@ -23,6 +24,10 @@ FORMULAS = Path(__file__).resolve().parent.parent / "model.md"
 
 def build(folder: Path) -> None:
     """Write every page into `folder`, in place of an older reference."""
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / "formulas.html").is_file():
+        raise SystemExit(
+            f"{folder}: expected a new folder or an older reference, found other content; name another"
+        )
     with written_annotations():
         modules = {name: pdoc.doc.Module.from_name(name) for name in pdoc.extract.walk_specs([PACKAGE])}
         for module in modules.values():
@@ -46,14 +51,11 @@ def build(folder: Path) -> None:
         pages["search.js"] = pdoc.render.search_index(modules)
     if links.broken:
         raise SystemExit("\n".join(["the reference was not written:", *links.broken]))
-    # Here, for the filters of warnings below come before any import of the package.
-    from bayes_impedance.outputs import whole_folder
-
-    with whole_folder(folder, marker="formulas.html") as place:
-        for name, page in pages.items():
-            path = place / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(page, encoding="utf-8")
+    shutil.rmtree(folder, ignore_errors=True)
+    for name, page in pages.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(page, encoding="utf-8")
 
 
 if __name__ == "__main__":
