@@ -5,13 +5,13 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
-SOURCES := bayes_impedance tests benchmarks
+SOURCES := bayes_impedance tests benchmarks docs conftest.py
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint types format bench results hooks clean
+.PHONY: help demo test lint types format bench results docs hooks clean
 
 help:
-	@sed -n '1,2p' Makefile; echo "also: lint types format bench results hooks clean"
+	@sed -n '1,2p' Makefile; echo "also: lint types format bench results docs hooks clean"
 
 $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -48,8 +48,12 @@ bench: $(INSTALLED)
 results: $(INSTALLED)
 	$(BIN)/python -m benchmarks.core_results
 
+# The API reference, from the docstrings, in docs/api/.
+docs: $(INSTALLED)
+	$(BIN)/python docs/reference docs/api
+
 hooks: $(INSTALLED)
 	$(BIN)/pre-commit install
 
 clean:
-	rm -rf $(VENV) build dist demo .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist demo docs/api .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,7 +1,26 @@
-"""Interaction forces between a person and a robot: arm impedance and intention by Gaussian processes.
+"""Arm impedance and intention from motion and interaction force, with Gaussian processes.
 
-High level: `read_log`, `load_config`, `ImpedanceModel`, `evaluate`, `cross_validate`, `prior_sensitivity`,
-`save_model`, `load_model`. Under it: `bayes_impedance.kernels`, ordinary gpytorch kernels to take into one's own code.
+A person holds a robot's handle. From logged motion and interaction force, `bayes_impedance` infers what the
+person's arm is (mass, damping, stiffness) and where the person wants to go (the desired trajectory), with honest
+uncertainty, and predicts the force that follows. Every estimate of impedance comes with a verdict: supported by
+these data, weakly, or prior only.
+
+    from bayes_impedance import ImpedanceModel, read_log
+
+    log = read_log("demo/training.csv")
+    model = ImpedanceModel.from_config("phase", ["preprocessing.rate=12.5"]).fit(log)
+    posterior = model.posterior(log)
+    print(posterior["stiffness"].mean[:3], model.verdicts()[0].sentence)
+
+Two levels:
+
+- High: `read_log` and `load_config` take in data and choices; `ImpedanceModel` fits, gives a `Posterior` of every
+  `Latent` and a `Verdict` on every impedance; `evaluate` scores it on another log, `cross_validate` on parts of its own;
+  `prior_sensitivity` tells what rests on a prior; `save_model` and `load_model` keep it. Each failure that input can cause is a `BayesImpedanceError`.
+- Under it: `bayes_impedance.kernels` are ordinary gpytorch kernels (`ImpedanceKernel`, `PDKernel`,
+  `InteractionKernel`) for models of one's own; `bayes_impedance.engines` computes exact likelihoods with them.
+
+The formulas are in docs/model.md, whose section numbers the docstrings quote. Everything is in SI units.
 """
 
 from bayes_impedance.config import Config as Config

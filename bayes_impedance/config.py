@@ -20,10 +20,15 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from bayes_impedance.errors import ConfigurationError
 
+#: Axis of motion and force.
 Axis = Literal["x", "y", "z"]
+#: What a process may depend on.
 Component = Literal["time", "phase", "position", "velocity"]
+#: θ, what the desired trajectory depends on.
 TrajectoryInput = Literal["time", "phase", "position", "position_velocity"]
+#: Prior mean of the desired trajectory (docs/model.md §1).
 TrajectoryMean = Literal["equilibrium", "reference", "trial_average", "constant"]
+#: Covariance of the desired trajectory.
 ProfileName = Literal["squared_exponential", "rational_quadratic", "matern52", "matern72", "matern92"]
 
 #: Above this log-SD the product of a log-normal stiffness and a displacement is so heavy-tailed
@@ -75,6 +80,7 @@ def _as_number(value: Any) -> float | None:
     return value if isinstance(value, (int, float)) and not isinstance(value, bool) else None
 
 
+#: A hyperparameter, for which a bare number may stand: a fixed value.
 Scale = Annotated[Hyperparameter, BeforeValidator(_number_means_fixed)]
 
 
@@ -428,7 +434,13 @@ def shipped_configurations() -> dict[str, Path]:
 def load_config(source: str | Path, overrides: Iterable[str] = ()) -> Config:
     """Configuration from a YAML file, or from the name of a shipped one, with KEY=VALUE overrides.
 
-    Raises ConfigurationError naming the file, the key and the nearest known key.
+    Example:
+        >>> config = load_config("phase", ["preprocessing.rate=50", "model.mass.level=1.2"])
+        >>> config.preprocessing.rate, config.model.mass.level.fixed
+        (50.0, True)
+
+    Raises:
+        ConfigurationError: names the file, the key and the nearest known key.
     """
     path = Path(source)
     if not path.is_file():
@@ -453,7 +465,14 @@ def load_config(source: str | Path, overrides: Iterable[str] = ()) -> Config:
 def parse_config(content: Any, where: str = "configuration", overrides: Iterable[str] = ()) -> Config:
     """Configuration from plain mappings; `where` is named in errors.
 
-    Raises ConfigurationError as load_config does.
+    Example:
+        >>> parse_config({"model": {"stifness": {"level": 300}}}, "arm.yaml")
+        Traceback (most recent call last):
+        ...
+        bayes_impedance.errors.ConfigurationError: arm.yaml: unknown key 'model.stifness'; did you mean 'stiffness'?
+
+    Raises:
+        ConfigurationError: as `load_config` does.
     """
     if not isinstance(content, Mapping):
         raise ConfigurationError(f"{where}: expected a mapping of sections, got {type(content).__name__}")
@@ -485,7 +504,7 @@ def replace_value(config: Config, key: str, value: Any) -> Config:
 
 def dump_config(config: Config) -> str:
     """The whole configuration, defaults included, as YAML."""
-    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
 
 
 def _override(content: dict[str, Any], assignment: str) -> dict[str, Any]:

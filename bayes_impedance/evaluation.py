@@ -58,6 +58,15 @@ def evaluate(
     `baselines` are trained on the model's training log, as are those of `against` (name → model) that are not fitted;
     one that is fitted counts as it is. MSLL of every row is against the forces that `model` was trained on.
 
+    Example:
+        >>> from bayes_impedance.simulation.generative import draw_force, repeated_motion
+        >>> model = ImpedanceModel.from_config("phase", ["training.restarts=1", "training.max_iterations=5"])
+        >>> motion = repeated_motion(repetitions=3, duration=2.0, rate=10.0, axes=("x",))
+        >>> log = draw_force(model.config, motion, seed=0)
+        >>> scores = evaluate(model.fit(log.select([0, 1])), log.select([2]))
+        >>> scores["x"]["impedance"].n
+        20
+
     Raises:
         LogError: the log has no force, or the same force throughout.
         ConfigurationError: a baseline is unknown, or a model of `against` is not of the same samples.

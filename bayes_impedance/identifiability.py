@@ -82,7 +82,12 @@ def assess(
 
 
 def classify(contraction: float) -> Support:
-    """Support from contraction: at least .75 supported, at least .25 weak, below that the prior."""
+    """Support from contraction: at least .75 supported, at least .25 weak, below that the prior.
+
+    Example:
+        >>> classify(0.8).value, classify(0.1).value
+        ('supported by these data', 'prior only')
+    """
     if contraction >= SUPPORTED:
         return Support.SUPPORTED
     return Support.WEAK if contraction >= WEAK else Support.PRIOR_ONLY
@@ -162,7 +167,12 @@ def caveat(verdicts: Iterable[Verdict], posterior: Posterior, config: Config) ->
 
 
 def rounded(contraction: float) -> str:
-    """Contraction with two digits, never rounded up to certainty."""
+    """Contraction with two digits, never rounded up to certainty.
+
+    Example:
+        >>> rounded(0.823), rounded(0.9999)
+        ('0.82', '> 0.99')
+    """
     return "> 0.99" if contraction > 0.99 else f"{contraction:.2f}"
 
 
@@ -172,7 +182,7 @@ def _percentage(contraction: float) -> str:
 
 
 def summarise(verdicts: Iterable[Verdict]) -> dict[str, dict[str, float | str]]:
-    """JSON-able mapping from `stiffness_xx` … to estimate, interval, contraction and verdict."""
+    """JSON-able mapping from stiffness_xx, damping_xx, … to estimate, interval, contraction and verdict."""
     return {
         f"{v.latent.value}_{v.axis}{v.axis}": {
             "mean": v.mean,

@@ -42,7 +42,13 @@ class Trial:
 
     `time (n,)` [s]; `position`, `reference` `(n, a)` [m]; `force`, `perturbation` `(n, a)` [N], the force by
     the human on the robot; `velocity (n, a)` [m/s]; `acceleration (n, a)` [m/s²]; `repetition (n,)`; `phase
-    (n,)` [1]; `truth`: what a simulation knows, `(n,)` [SI] a column. InteractionLog checks and freezes.
+    (n,)` [1]; `truth`: what a simulation knows, `(n,)` [SI] a column. `InteractionLog` checks and freezes.
+
+    Example:
+        >>> time = np.arange(100) / 100.0
+        >>> position, force = 0.1 * np.sin(time)[:, None], 3.0 * np.cos(time)[:, None]
+        >>> Trial("first", group="Ada", source="memory", time=time, position=position, force=force)
+        Trial('first', group='Ada', source='memory', 100 samples)
     """
 
     name: str
@@ -113,7 +119,8 @@ class TrialSet(Generic[T]):
     def select(self, which: Callable[[T], bool] | Sequence[int]) -> Self:
         """Log of the trials that fulfil a predicate or have these indices, in the order given.
 
-        Raises LogError when that leaves no trial or an index does not exist.
+        Raises:
+            LogError: that leaves no trial, or an index does not exist.
         """
         chosen = chosen_trials(self.trials, which)
         # Past the constructor: the trials are checked, and an axis may well rest in a part of a log.
@@ -145,8 +152,18 @@ class TrialSet(Generic[T]):
 class InteractionLog(TrialSet[Trial]):
     """Trials that share their axes; arrays are float64, C-contiguous and read-only.
 
-    Raises LogError when a trial is not a valid recording, and warns (LogWarning) when a range looks like
-    a wrong unit.
+    Warns (LogWarning) when a range looks like a wrong unit.
+
+    Example:
+        >>> time = np.arange(100) / 100.0
+        >>> log = InteractionLog.from_arrays(time, 0.1 * np.sin(time), 3.0 * np.cos(time), axes=["x"])
+        >>> log
+        InteractionLog(axes=x, 1 trials, 100 samples)
+        >>> log.trials[0].force.shape
+        (100, 1)
+
+    Raises:
+        LogError: a trial is not a valid recording.
     """
 
     axes: tuple[str, ...]
@@ -185,9 +202,10 @@ class InteractionLog(TrialSet[Trial]):
         perturbation: npt.ArrayLike | None = None,
         truth: Mapping[str, npt.ArrayLike] | None = None,
     ) -> Self:
-        """Log of one trial in memory; arrays as in Trial, vectors of a single axis also as `(n,)`.
+        """Log of one trial in memory; arrays as in `Trial`, vectors of a single axis also as `(n,)`.
 
-        Raises LogError as the constructor does.
+        Raises:
+            LogError: as the constructor does.
         """
         optional: dict[str, Any] = {
             "force": force,
@@ -206,7 +224,8 @@ class InteractionLog(TrialSet[Trial]):
     def concatenate(cls, logs: Iterable[InteractionLog]) -> Self:
         """All trials of several logs, in their order.
 
-        Raises LogError when there is no log, when axes differ or when two trials share source and name.
+        Raises:
+            LogError: there is no log, axes differ, or two trials share source and name.
         """
         logs = tuple(logs)
         if not logs:
@@ -227,7 +246,8 @@ class InteractionLog(TrialSet[Trial]):
 def chosen_trials(trials: Sequence[T], which: Callable[[T], bool] | Sequence[int]) -> tuple[T, ...]:
     """Trials that fulfil a predicate or have these indices.
 
-    Raises LogError when none is left, or an index is out of range, repeated or a boolean.
+    Raises:
+        LogError: none is left, or an index is out of range, repeated or a boolean.
     """
     if callable(which):
         chosen = tuple(trial for trial in trials if which(trial))

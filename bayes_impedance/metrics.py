@@ -45,6 +45,12 @@ def score(mean: Array, sd: Array, force: Array, training_force: Array) -> Scores
 
     SMSE = mean squared error / variance of the test force. MSLL = mean of −log N(u; mean, sd²) less the
     same under a Gaussian with mean and variance of the training force. All arguments `(n,)` [N].
+
+    Example:
+        >>> force = np.array([0.0, 1.0, 2.0, 3.0])
+        >>> scores = score(force + 0.1, np.full(4, 0.2), force, training_force=force)
+        >>> scores.n, scores.coverage90, round(scores.smse, 3), scores.msll < 0
+        (4, 1.0, 0.008, True)
     """
     return pooled_score([Prediction(mean, sd, force, training_force)])
 

@@ -26,6 +26,7 @@ from bayes_impedance.priors import Entry, ForceModel, build_force_model
 from bayes_impedance.training import Progress, TrainingReport, observations, train
 from bayes_impedance.trajectory_mean import TrajectoryMean
 
+#: Forces that a posterior conditions on: of the training log, of the log at hand, or of both.
 Given = Literal["both", "training", "log"]
 
 
@@ -44,9 +45,13 @@ class ImpedanceModel:
     Immutable: `fit` returns a new model. Without a fit the hyperparameters stand at their medians.
 
     Example:
-        >>> model = ImpedanceModel.from_config("phase")
-        >>> model.is_fitted
-        False
+        >>> from bayes_impedance.simulation.generative import draw_force, repeated_motion
+        >>> motion = repeated_motion(repetitions=2, duration=2.0, rate=10.0, axes=("x",))
+        >>> model = ImpedanceModel.from_config("phase", ["training.restarts=1", "training.max_iterations=5"])
+        >>> model = model.fit(draw_force(model.config, motion, seed=0))
+        >>> stiffness = model.posterior(motion)["stiffness"]
+        >>> stiffness.mean.shape, bool((stiffness.quantile(0.05) > 0).all())
+        ((40, 1), True)
     """
 
     def __init__(self, config: Config, fit: Fit | None = None) -> None:

@@ -1,9 +1,11 @@
 """A trained model as a folder: YAML, JSON and safetensors, no pickle; loading gives the same bits.
 
-config.yaml                   the whole configuration
-hyperparameters.safetensors   unconstrained hyperparameters, by name
-data.safetensors              the prepared training log
-metadata.json                 schema and package version, training report, fingerprints
+The folder holds
+
+    config.yaml                   the whole configuration
+    hyperparameters.safetensors   unconstrained hyperparameters, by name
+    data.safetensors              the prepared training log
+    metadata.json                 schema and package version, training report, fingerprints
 """
 
 from __future__ import annotations
@@ -39,6 +41,15 @@ FILES = ("config.yaml", "hyperparameters.safetensors", "data.safetensors")
 def save_model(model: ImpedanceModel, folder: str | Path) -> None:
     """Write a fitted model to `folder`, whole or not at all; a model that was there is replaced.
 
+    Example:
+        >>> from bayes_impedance.simulation.generative import draw_force, repeated_motion
+        >>> model = ImpedanceModel.from_config("phase", ["training.restarts=1", "training.max_iterations=1"])
+        >>> log = draw_force(model.config, repeated_motion(repetitions=2, duration=2.0, rate=10.0), seed=0)
+        >>> model = model.fit(log)
+        >>> save_model(model, "model")
+        >>> sorted(path.suffix for path in Path("model").iterdir())
+        ['.json', '.safetensors', '.safetensors', '.yaml']
+
     Raises:
         OutputError: the folder cannot be written.
         ConfigurationError: the model is not fitted.
@@ -66,6 +77,16 @@ def save_model(model: ImpedanceModel, folder: str | Path) -> None:
 
 def load_model(folder: str | Path) -> ImpedanceModel:
     """The model that `save_model` wrote, predicting the same to the last bit.
+
+    Example:
+        >>> from bayes_impedance.simulation.generative import draw_force, repeated_motion
+        >>> model = ImpedanceModel.from_config("phase", ["training.restarts=1", "training.max_iterations=1"])
+        >>> log = draw_force(model.config, repeated_motion(repetitions=2, duration=2.0, rate=10.0), seed=0)
+        >>> model = model.fit(log)
+        >>> save_model(model, "model")
+        >>> before, after = (m.posterior(log)["force"].mean for m in (model, load_model("model")))
+        >>> bool((before == after).all())
+        True
 
     Raises:
         ModelFolderError: the folder is missing, incomplete, changed, or of a newer schema.

@@ -52,6 +52,14 @@ class Marginal:
 
     `location`, `scale`: mean and SD of the Gaussian variable, `(samples, axes)`: the latent, or its
     logarithm where `warped`.
+
+    Example:
+        >>> location, scale = np.log([[300.0], [200.0]]), np.full((2, 1), 0.1)
+        >>> stiffness = Marginal(Latent.STIFFNESS, True, location, scale, location, 10 * scale)
+        >>> stiffness.quantile(0.5).round().tolist()
+        [[300.0], [200.0]]
+        >>> stiffness.contraction.round(2).tolist()
+        [0.99]
     """
 
     latent: Latent

@@ -117,7 +117,8 @@ class PreparedLog(TrialSet[PreparedTrial]):
     def from_arrays(cls, header: Mapping[str, Any], arrays: Mapping[str, npt.NDArray[Any]]) -> Self:
         """The log that gave `header` and `arrays`, to the last bit.
 
-        Raises LogError when the header is not one, an array lacks or one belongs to no trial.
+        Raises:
+            LogError: the header is not one, an array lacks or one belongs to no trial.
         """
         left = dict(arrays)
         try:
@@ -156,7 +157,17 @@ class PreparedLog(TrialSet[PreparedTrial]):
 def prepare(log: InteractionLog, config: PreprocessingConfig) -> PreparedLog:
     """Every trial checked for gaps, put on an even grid, smoothed, differentiated and thinned to `rate`.
 
-    Raises LogError naming source and trial; warns (LogWarning) when the smoother needs a longer window.
+    Warns (LogWarning) when the smoother needs a longer window.
+
+    Example:
+        >>> time = np.arange(200) / 100.0
+        >>> log = InteractionLog.from_arrays(time, time**2, np.sin(time), axes=["x"])
+        >>> prepared = prepare(log, PreprocessingConfig(rate=20))
+        >>> prepared.n_samples, prepared.trials[0].acceleration.mean().round(6).item()
+        (40, 2.0)
+
+    Raises:
+        LogError: names source and trial.
     """
     return PreparedLog(log.axes, tuple(_prepare(trial, config) for trial in log.trials))
 

@@ -93,7 +93,11 @@ class TrajectoryMean:
 
 
 def phase_derivatives(trial: PreparedTrial) -> tuple[Array, Array, Array]:
-    """φ, φ̇ and φ̈ of a trial, `(n,)` each [1, 1/s, 1/s²]; LogError where it has no phase."""
+    """φ, φ̇ and φ̈ of a trial, `(n,)` each [1, 1/s, 1/s²].
+
+    Raises:
+        LogError: the trial has no phase.
+    """
     if trial.phase is None or trial.phase_velocity is None or trial.phase_acceleration is None:
         raise LogError(
             f"{trial.source}, trial {trial.name}: expected a phase column, found none; name it in "

@@ -17,6 +17,9 @@ class NaiveModel:
     """u ~ GP(0, SE(ξ)) + noise, one function a group, trained with the same care as the impedance model.
 
     Hyperpriors are those of the impedance model's residual and noise; optimiser and restarts are the same.
+
+    Raises:
+        LogError: the training log has no force.
     """
 
     def __init__(self, config: Config, log: PreparedLog, progress: Progress | None = None) -> None:

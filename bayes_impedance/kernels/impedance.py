@@ -131,6 +131,16 @@ class ImpedanceKernel(BatchedKernel):
         stiffness, damping: priors of k [N/m] and d [Ns/m] over their `active_dims`.
         mass: prior of m [kg]; None leaves the acceleration out (`PDKernel`).
 
+    Example:
+        >>> layout = InputLayout(theta=(0,), theta_velocity=(1,))  # a column of time, and one of its rate, 1
+        >>> k, d, m = (ImpedanceProcess(StationaryKernel(num_dims=0)) for _ in range(3))
+        >>> kernel = ImpedanceKernel(layout, StationaryKernel(), k, d, m).double()
+        >>> kernel.stiffness.level, kernel.damping.level, kernel.mass.level = 300.0, 20.0, 1.5
+        >>> time = torch.linspace(0.0, 1.0, 5, dtype=torch.float64)
+        >>> x = torch.stack([time, torch.ones_like(time)], dim=-1)
+        >>> tuple(kernel(x).shape)
+        (5, 5)
+
     Raises:
         TypeError: input and hyperparameters of different dtype.
     """
@@ -254,7 +264,15 @@ def PDKernel(  # noqa: N802 - named as the kernel it builds
     damping: ImpedanceProcess,
     active_dims: tuple[int, ...] | None = None,
 ) -> ImpedanceKernel:
-    """Covariance of k e + d ė: the paper's PD kernel (13), an `ImpedanceKernel` without mass."""
+    """Covariance of k e + d ė: the paper's PD kernel (13), an `ImpedanceKernel` without mass.
+
+    Example:
+        >>> layout = InputLayout(theta=(0,), theta_velocity=(1,))  # a column of time, and one of its rate, 1
+        >>> k, d = (ImpedanceProcess(StationaryKernel(num_dims=0)) for _ in range(2))
+        >>> kernel = PDKernel(layout, StationaryKernel("matern52"), k, d)
+        >>> kernel.order
+        1
+    """
     return ImpedanceKernel(layout, trajectory, stiffness, damping, mass=None, active_dims=active_dims)
 
 
@@ -266,6 +284,16 @@ class InteractionKernel(BatchedKernel):
     Args:
         impedance: covariance of the impedance force.
         residual: any gpytorch kernel for ũ; None for no residual.
+
+    Example:
+        >>> layout = InputLayout(theta=(0,), theta_velocity=(1,))  # a column of time, and one of its rate, 1
+        >>> k, d, m = (ImpedanceProcess(StationaryKernel(num_dims=0)) for _ in range(3))
+        >>> impedance = ImpedanceKernel(layout, StationaryKernel(), k, d, m)
+        >>> kernel = InteractionKernel(impedance, residual=StationaryKernel(active_dims=(0,))).double()
+        >>> time = torch.linspace(0.0, 1.0, 5, dtype=torch.float64)
+        >>> x = torch.stack([time, torch.ones_like(time)], dim=-1)
+        >>> tuple(kernel.cross_covariance(x, x[:2], Latent.DESIRED_POSITION).shape)
+        (5, 2)
     """
 
     def __init__(

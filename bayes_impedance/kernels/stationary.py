@@ -134,6 +134,7 @@ class Matern(Profile):
         return ProfileDerivatives(torch.exp(-z), (ratios[0], ratios[1], ratios[2], ratios[3], ratios[4]))
 
 
+#: Profiles by the name that configurations give them.
 PROFILES: dict[str, Profile] = {
     "squared_exponential": SquaredExponential(),
     "rational_quadratic": RationalQuadratic(),
@@ -194,6 +195,14 @@ class StationaryKernel(BatchedKernel):
         ard: one length scale a dimension (True) or one for all.
         sd_prior, lengthscale_prior, shape_prior: priors of the hyperparameters.
         sd_constraint, lengthscale_constraint: constraints; default positive, on a log scale.
+
+    Example:
+        >>> kernel = StationaryKernel("matern52").double()
+        >>> kernel.sd, kernel.lengthscale = 2.0, 0.3
+        >>> time = torch.linspace(0.0, 1.0, 5, dtype=torch.float64).unsqueeze(-1)
+        >>> covariance = kernel(time).to_dense()
+        >>> tuple(covariance.shape), round(covariance[0, 0].item(), 6)
+        ((5, 5), 4.0)
 
     Raises:
         ValueError: an unknown profile.

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from bayes_impedance.kernels.stationary import BatchedKernel, register_positive, set_positive
 
+#: Whether w itself is a Gaussian process, or its logarithm.
 Law = Literal["gaussian", "log_gaussian"]
 
 
@@ -27,6 +28,14 @@ class ImpedanceProcess(BatchedKernel):
         covariance: gpytorch kernel of w (gaussian) or of log w (log_gaussian), over its `active_dims`.
         law: "gaussian" or "log_gaussian".
         level_prior, level_constraint: of the level `(*batch, 1, 1)`: the mean of w, or the median.
+
+    Example:
+        >>> from bayes_impedance.kernels import StationaryKernel
+        >>> stiffness = ImpedanceProcess(StationaryKernel()).double()
+        >>> stiffness.level, stiffness.covariance.sd = 300.0, 0.3
+        >>> phase = torch.linspace(0.0, 1.0, 5, dtype=torch.float64).unsqueeze(-1)
+        >>> round(stiffness.expectation(phase)[0, 0].item(), 1)  # 300 exp(0.3² / 2) N/m
+        313.8
 
     Raises:
         ValueError: an unknown law.

@@ -44,9 +44,19 @@ UNREADABLE = (OSError, ValueError, pa.ArrowException)
 def read_log(
     paths: str | Path | Sequence[str | Path], config: LogConfig | None = None, *, require_force: bool = True
 ) -> InteractionLog:
-    """Interaction log of one or several files, mapped by `config` (default: LogConfig()) to SI.
+    """Interaction log of one or several files, mapped by `config` (default: `LogConfig()`) to SI.
 
-    Without `require_force` a file may lack force. Raises LogError naming file, column and row.
+    Without `require_force` a file may lack force.
+
+    Example:
+        >>> cells = {"time": [0, 10, 20], "position_x": [0.10, 0.11, 0.13], "force_x": [1.5, 1.6, 1.4]}
+        >>> pd.DataFrame(cells).to_csv("log.csv", index=False)
+        >>> log = read_log("log.csv", LogConfig.model_validate({"units": {"time": "ms"}}))
+        >>> log.trials[0].time.tolist()
+        [0.0, 0.01, 0.02]
+
+    Raises:
+        LogError: names file, column and row.
     """
     config = LogConfig() if config is None else config
     files = [Path(path) for path in ([paths] if isinstance(paths, (str, Path)) else paths)]

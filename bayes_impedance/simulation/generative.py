@@ -40,6 +40,11 @@ def repeated_motion(
 
     Path: a figure of eight, .2 m wide, as `reference` [m]. Displacement: five sinusoids of .3 to 2 Hz with
     SD `displacement_sd` [m]. Every derivative is exact. `duration` [s] and `rate` [Hz] of a repetition.
+
+    Example:
+        >>> motion = repeated_motion(repetitions=3, duration=2.0, rate=50.0, axes=("x",))
+        >>> len(motion.trials), motion.trials[0].position.shape, motion.trials[0].force is None
+        (3, (100, 1), True)
     """
     generator = np.random.default_rng(seed)
     trials = []
@@ -79,6 +84,13 @@ def draw_force(
 
     Hyperparameters are those of `force_model`, else the medians of `config`. Impedance and, where trials
     share it, the desired trajectory are drawn once a group.
+
+    Example:
+        >>> from bayes_impedance.config import load_config
+        >>> motion = repeated_motion(repetitions=2, duration=2.0, rate=10.0, axes=("x",))
+        >>> trial = draw_force(load_config("phase"), motion, seed=0).trials[0]
+        >>> trial.force.shape, bool((trial.truth["stiffness_xx"] > 0).all())
+        ((20, 1), True)
     """
     generator = torch.Generator().manual_seed(seed)
     feature_map = FeatureMap(config, motion.axes)
