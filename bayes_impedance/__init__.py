@@ -15,8 +15,9 @@ these data, weakly, or prior only.
 Two levels:
 
 - High: `read_log` and `load_config` take in data and choices; `ImpedanceModel` fits, gives a `Posterior` of every
-  `Latent` and a `Verdict` on every impedance; `evaluate` scores it on another log, `cross_validate` on parts of its own;
-  `prior_sensitivity` tells what rests on a prior; `save_model` and `load_model` keep it. Each failure that input can cause is a `BayesImpedanceError`.
+  `Latent` and a `Verdict` on every impedance; `evaluate` scores it on another log, `cross_validate` on parts of its
+  own; `prior_sensitivity` tells what rests on a prior; `save_model` and `load_model` keep it. Each failure that input
+  can cause is a `BayesImpedanceError`.
 - Under it: `bayes_impedance.kernels` are ordinary gpytorch kernels (`ImpedanceKernel`, `PDKernel`,
   `InteractionKernel`) for models of one's own; `bayes_impedance.engines` computes exact likelihoods with them.
 

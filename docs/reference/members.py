@@ -131,7 +131,7 @@ def _present_field(variable: Any, info: FieldInfo) -> None:
     allowed = ["required"] if info.is_required() else []
     for constraint in info.metadata:
         allowed += [
-            f"{sign} {getattr(constraint, key)}"
+            f"{sign} {getattr(constraint, key):g}"
             for key, sign in CONSTRAINTS.items()
             if hasattr(constraint, key)
         ]
