@@ -44,9 +44,11 @@ bench: $(INSTALLED)
 	for file in benchmarks/test_*.py; do \
 		$(BIN)/python -m pytest $$file --benchmark-disable-gc -q -p no:cacheprovider -n 0 || exit 1; done
 
-# The figures quoted in the README and the notebooks; writes results/core.json.
+# The figures quoted in the README and the notebooks; writes results/*.json. Some twenty minutes on two cores.
 results: $(INSTALLED)
 	$(BIN)/python -m benchmarks.core_results
+	$(BIN)/python -m benchmarks.recordings_results
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.closed_loop_results
 
 # The API reference, from the docstrings, in docs/api/.
 docs: $(INSTALLED)

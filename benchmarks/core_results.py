@@ -11,9 +11,7 @@ import json
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -26,14 +24,11 @@ from bayes_impedance.posterior import compute_posterior
 from bayes_impedance.priors import build_force_model
 from bayes_impedance.simulation.generative import draw_force, repeated_motion
 from bayes_impedance.trajectory_mean import TrajectoryMean
+from benchmarks.results import RECORDINGS, Results, commit, committed
 
-ROOT = Path(__file__).resolve().parent.parent
-OUTPUT = ROOT / "results" / "core.json"
-RECORDING = ROOT.parent / "shared/data/iiwa_known_equilibrium/RobotData_Circle_2025-03-25_14-19-22.txt"
+RECORDING = RECORDINGS / "iiwa_known_equilibrium/RobotData_Circle_2025-03-25_14-19-22.txt"
 SHIFT_SAMPLES = 200  # one second at 200 Hz
 DRAWS = 50
-
-Results = dict[str, Any]
 
 
 def known_equilibrium() -> Results:
@@ -185,13 +180,11 @@ def main() -> None:
     if not RECORDING.is_file():
         print(f"skipped known_equilibrium: no {RECORDING.name} in ../shared/data; its committed figures stay")
         del parts["known_equilibrium"]
-    figures = json.loads(OUTPUT.read_text(encoding="utf-8"))["figures"] if OUTPUT.is_file() else {}
+    figures = committed("core")
     for name, compute in parts.items():
         figures[name] = compute()
         print(name, json.dumps(figures[name], indent=2))
-    versions = {package: version(package) for package in ("bayes-impedance", "torch", "gpytorch", "numpy")}
-    record = {"command": "make results", "seed": 0, "versions": versions, "figures": figures}
-    OUTPUT.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+    commit("core", 0, figures)
 
 
 if __name__ == "__main__":

@@ -73,6 +73,7 @@ def test_shipped_configurations_are_these():
         "admittance",
         "position",
         "position_velocity",
+        "recordings/delta_robot",
         "recordings/iiwa_known_equilibrium",
     }
 

@@ -48,7 +48,13 @@ def test_commands_run_in_the_order_shown(place: Path) -> None:
     commands = [
         line for block in blocks("sh") for line in block.splitlines() if line.startswith("bayes-impedance")
     ]
-    assert [command.split()[1] for command in commands] == ["train", "infer", "evaluate", "show"]
+    assert [command.split()[1] for command in commands] == [
+        "train",
+        "infer",
+        "evaluate",
+        "evaluate",
+        "show",
+    ]
     for command in commands:
         arguments = [sys.executable, "-m", "bayes_impedance", *shlex.split(command)[1:]]
         result = subprocess.run(arguments, cwd=place, capture_output=True, text=True, check=False)
