@@ -29,5 +29,13 @@ class OutputError(BayesImpedanceError):
     """An output file or folder cannot be written."""
 
 
-class LogWarning(UserWarning):
+class BayesImpedanceWarning(UserWarning):
+    """Base of every warning that a user should read."""
+
+
+class LogWarning(BayesImpedanceWarning):
     """The recording can be used, but something in it looks wrong."""
+
+
+class JournalWarning(BayesImpedanceWarning):
+    """Training goes on, but could not be continued from here if it were killed."""

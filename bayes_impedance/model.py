@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 
@@ -16,6 +17,7 @@ from bayes_impedance.engines.pointwise import PointPredictor
 from bayes_impedance.errors import ConfigurationError, LogError
 from bayes_impedance.features import FeatureMap, check_combination, count_repetitions, label_trials, trial_key
 from bayes_impedance.identifiability import Verdict, assess
+from bayes_impedance.journal import Journal
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.log import InteractionLog
 from bayes_impedance.posterior import Posterior, compute_posterior
@@ -101,11 +103,19 @@ class ImpedanceModel:
             )
         return prepared
 
-    def fit(self, log: InteractionLog | PreparedLog, progress: Progress | None = None) -> ImpedanceModel:
+    def fit(
+        self,
+        log: InteractionLog | PreparedLog,
+        progress: Progress | None = None,
+        journal: Journal | None = None,
+    ) -> ImpedanceModel:
         """A new model with hyperparameters trained on `log` (MAP of the marginal likelihood).
+
+        `journal` keeps every evaluation, and a training that was killed continues from it to the same bits.
 
         Raises:
             LogError, ConfigurationError, TooManySamplesError, NotPositiveDefiniteError.
+            OutputError: the journal is of another training, or cannot be written.
         """
         prepared = ImpedanceModel(self.config).prepare(log)
         feature_map = FeatureMap(self.config, prepared.axes)
@@ -114,7 +124,11 @@ class ImpedanceModel:
             raise LogError("expected a log with force to train on, found none; name log.columns.force")
         self._check_capacity(prepared)
         force_model = build_force_model(self.config, feature_map)
-        report = train(force_model, features, self.config.training, self.config.engine.jitter, progress)
+        if journal is not None:
+            journal.begin(self._objective_of(prepared))
+        report = train(
+            force_model, features, self.config.training, self.config.engine.jitter, progress, journal=journal
+        )
         return ImpedanceModel(self.config, Fit(force_model, prepared, report))
 
     def posterior(
@@ -217,6 +231,15 @@ class ImpedanceModel:
         if self._fit is not None:
             return copy.deepcopy(self._fit.force_model)
         return build_force_model(self.config, feature_map)
+
+    def _objective_of(self, log: PreparedLog) -> dict[str, object]:
+        """All that the objective of training depends on; `training` says only where it is evaluated."""
+        return {
+            "bayes_impedance": version("bayes-impedance"),
+            "torch": version("torch"),
+            "configuration": self.config.model_dump(mode="json", exclude={"training", "baseline"}),
+            "recordings": log.fingerprint()[:16],
+        }
 
     def _mean(self, log: PreparedLog) -> TrajectoryMean:
         """Prior mean of x_d, learned from the training log where there is one, else from `log` itself."""

@@ -15,7 +15,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
         frozenset,
         (
             {"errors"},
-            {"config", "outputs"},
+            {"config", "outputs", "journal"},
             {"log", "metrics"},
             {"readers", "readers.table", "preprocessing"},
             {"trajectory_mean"},
@@ -61,6 +61,7 @@ CONFINED = {
     "yaml": {"config"},
     "safetensors": {"persistence"},
     "pyarrow": {"readers.table"},
+    "filelock": {"journal"},
 }
 
 
