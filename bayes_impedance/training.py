@@ -97,7 +97,7 @@ def train(
     hyperprior. Interrupting (Ctrl-C) keeps the best found so far. What `journal` remembers is not computed again.
 
     Raises:
-        NotPositiveDefiniteError: no restart found a covariance that factorises.
+        NotPositiveDefiniteError: no restart found a covariance that factorises, or a finite likelihood.
     """
     search = _Search(model, features, jitter, journal)
     generator = np.random.default_rng(config.seed)
@@ -118,9 +118,12 @@ def train(
         if interrupted or not start.size:
             break
     if not np.isfinite(search.best_objective).all():
-        if failure is not None:
-            raise failure
-        raise KeyboardInterrupt
+        if interrupted and failure is None:
+            raise KeyboardInterrupt
+        if journal is not None and not interrupted:
+            # Continuing would lead nowhere either.
+            journal.remove()
+        raise failure or _nowhere_finite(search)
     search.restore()
     log_sd: dict[str, list[list[float]]] = {}
     if not interrupted:
@@ -137,6 +140,14 @@ def train(
         log_sd=log_sd,
         interrupted=interrupted,
         samples=sum(len(rows) for rows in features.rows),
+    )
+
+
+def _nowhere_finite(search: _Search) -> NotPositiveDefiniteError:
+    count = int((~np.isfinite(search.best_objective)).sum())
+    return NotPositiveDefiniteError(
+        f"expected a finite likelihood somewhere, found none for {count} of {search.axes} axes in any restart; check "
+        "log.units, and that the medians under model are of the size that their unit lets expect"
     )
 
 
