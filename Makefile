@@ -8,10 +8,10 @@ INSTALLED := $(VENV)/.installed
 SOURCES := bayes_impedance tests benchmarks
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint types format bench results hooks clean
+.PHONY: help demo test lint types format bench results faults hooks clean
 
 help:
-	@sed -n '1,2p' Makefile; echo "also: lint types format bench results hooks clean"
+	@sed -n '1,2p' Makefile; echo "also: lint types format bench results faults hooks clean"
 
 $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -47,6 +47,10 @@ bench: $(INSTALLED)
 # The figures quoted in the README and the notebooks; writes results/core.json.
 results: $(INSTALLED)
 	$(BIN)/python -m benchmarks.core_results
+
+# Five thousand generated inputs; writes results/faults.json unless one ends in a traceback.
+faults: $(INSTALLED)
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.generated_inputs
 
 hooks: $(INSTALLED)
 	$(BIN)/pre-commit install

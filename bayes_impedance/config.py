@@ -28,6 +28,9 @@ ProfileName = Literal["squared_exponential", "rational_quadratic", "matern52", "
 #: (kurtosis 3 exp(4 s²)) that a Gaussian with the same two moments misleads.
 LARGEST_LOG_SD = 0.5
 
+#: Far beyond what makes sense in any unit, so that squares and products of medians stay within float64.
+MEDIANS = (1e-30, 1e30)
+
 #: What PyYAML raises at a text that it cannot turn into values (13 months, a thousand brackets).
 UNREADABLE = (yaml.YAMLError, ValueError, RecursionError)
 
@@ -48,6 +51,15 @@ class Hyperparameter(Section):
     median: float = Field(gt=0)
     log_sd: float = Field(default=1.0, gt=0, le=5)
     fixed: bool = False
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        low, high = MEDIANS
+        if not low <= self.median <= high:
+            raise ValueError(
+                f"median: expected between {low:g} and {high:g}, got {self.median:g}; check its unit"
+            )
+        return self
 
 
 def _number_means_fixed(value: Any) -> Any:

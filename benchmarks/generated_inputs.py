@@ -10,6 +10,7 @@ import contextlib
 import io
 import json
 import math
+import multiprocessing
 import re
 import signal
 import sys
@@ -19,7 +20,8 @@ import traceback
 import warnings
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from unittest import mock
@@ -32,8 +34,8 @@ from bayes_impedance.errors import BayesImpedanceWarning
 from tests.strategies import Case, cases
 
 OUTPUT = Path(__file__).resolve().parent.parent / "results" / "faults.json"
-COUNT, SEED = 5000, 0
-#: A command that takes longer hangs [s].
+COUNT, SEEDS = 5000, 20
+#: A case that takes longer hangs [s].
 PATIENCE = 60
 
 #: So that an accepted case takes a blink.
@@ -41,7 +43,7 @@ QUICK = ("training.restarts=1", "training.max_iterations=1")
 
 
 class Hang(BaseException):
-    """A command did not end."""
+    """A case did not end."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,6 @@ def run(*arguments: object) -> Ending:
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
         warnings.catch_warnings(),
-        _patience(),
     ):
         warnings.simplefilter("error")
         warnings.simplefilter("default", BayesImpedanceWarning)
@@ -121,8 +122,9 @@ def follow(case: Case) -> list[Ending]:
         endings += [
             checked(run("infer", model, other, "--out", posterior), folder, posterior),
             checked(run("evaluate", model, other, "--json", scores, *baseline), folder, scores),
-            checked(run("show", model), folder, None),
         ]
+        if not case.baseline:
+            endings.append(checked(run("show", model), folder, None))
         if posterior.exists():
             numbers = pd.read_csv(posterior, dtype={"trial": str, "group": str}).select_dtypes("number")
             assert numbers.map(math.isfinite).all(axis=None), "a posterior that is not finite"
@@ -154,16 +156,30 @@ def checked(ending: Ending, folder: Path, output: Path | None) -> Ending:
     return ending
 
 
-def main() -> None:
-    """Run them all and write the committed JSON."""
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else COUNT
-    endings: Counter[str] = Counter()
-    errors: Counter[str] = Counter()
-    bugs: Counter[str] = Counter()
-    slowest = 0.0
-    start = time.perf_counter()
+@dataclass
+class Tally:
+    """What became of the cases of one seed."""
 
-    @seed(SEED)
+    generated: int = 0
+    commands: Counter[str] = field(default_factory=Counter)
+    refusals: Counter[str] = field(default_factory=Counter)
+    bugs: dict[str, int] = field(default_factory=Counter)
+    slowest: float = 0.0
+
+    def add(self, other: Tally) -> None:
+        """Count the cases of another seed in."""
+        self.generated += other.generated
+        self.commands += other.commands
+        self.refusals += other.refusals
+        self.bugs = Counter(self.bugs) + Counter(other.bugs)
+        self.slowest = max(self.slowest, other.slowest)
+
+
+def tally(number: int, count: int) -> Tally:
+    """Follow `count` cases that are generated from one seed."""
+    total = Tally()
+
+    @seed(number)
     @settings(
         max_examples=count,
         database=None,
@@ -173,43 +189,54 @@ def main() -> None:
     )
     @given(cases())
     def every(case: Case) -> None:
-        nonlocal slowest
-        begun = time.perf_counter()
-        endings["generated"] += 1
+        start = time.perf_counter()
+        total.generated += 1
         try:
-            found = follow(case)
+            with _patience():
+                endings = follow(case)
         except (Exception, Hang):
-            # Each is a bug; all are counted, and one of each kind is shown.
-            where = traceback.extract_tb(sys.exc_info()[2])[-1]
-            bugs[f"{where.filename}:{where.lineno} {sys.exc_info()[1]!r:.200}"] += 1
-            if bugs.total() == len(bugs):
-                traceback.print_exc()
+            # A bug: all are counted, and the first of a kind is shown.
+            place = traceback.extract_tb(sys.exc_info()[2])[-1]
+            bug = f"{Path(place.filename).name}:{place.lineno} {sys.exc_info()[1]!r:.200}"
+            if bug not in total.bugs:
+                print(f"seed {number}:", traceback.format_exc()[-3000:], case, file=sys.stderr, flush=True)
+            total.bugs[bug] += 1
             return
-        slowest = max(slowest, time.perf_counter() - begun)
-        for ending in found:
-            endings[f"{ending.command} {'refused' if ending.code else 'accepted'}"] += 1
+        total.slowest = max(total.slowest, time.perf_counter() - start)
+        for ending in endings:
+            total.commands[f"{ending.command} {'refused' if ending.code else 'accepted'}"] += 1
             if ending.error is not None:
-                errors[f"{ending.command}: {ending.error}"] += 1
-        if endings["generated"] % 100 == 0:
-            print(
-                f"{endings['generated']} in {time.perf_counter() - start:.0f} s: {dict(endings)}", flush=True
-            )
+                total.refusals[f"{ending.command}: {ending.error}"] += 1
 
     every()
+    return total
+
+
+def main() -> None:
+    """Run them all, a process for each core, and write the committed JSON."""
+    total, start = Tally(), time.perf_counter()
+    with ProcessPoolExecutor(mp_context=multiprocessing.get_context("spawn")) as pool:
+        for part in as_completed([pool.submit(tally, number, COUNT // SEEDS) for number in range(SEEDS)]):
+            total.add(part.result())
+            print(
+                f"{total.generated} in {time.perf_counter() - start:.0f} s: {dict(total.commands)}",
+                flush=True,
+            )
+    for bug, times in total.bugs.items():
+        print(f"{times} × {bug}", file=sys.stderr)
+    if total.bugs:
+        sys.exit(1)
     packages = ("bayes-impedance", "hypothesis", "numpy", "pandas", "torch")
     record = {
         "command": "make faults",
-        "seed": SEED,
+        "seeds": list(range(SEEDS)),
         "versions": {package: version(package) for package in packages},
-        "generated": endings.pop("generated"),
-        "tracebacks": bugs.total(),
-        "commands": dict(sorted(endings.items())),
-        "refusals": dict(sorted(errors.items())),
-        "slowest_seconds": round(slowest, 1),
+        "generated": total.generated,
+        "tracebacks": sum(total.bugs.values()),
+        "commands": dict(sorted(total.commands.items())),
+        "refusals": dict(sorted(total.refusals.items())),
+        "slowest_seconds": round(total.slowest, 1),
     }
-    if bugs:
-        print(*(f"{count} × {bug}" for bug, count in bugs.most_common()), sep="\n", file=sys.stderr)
-        sys.exit(1)
     OUTPUT.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
     print(json.dumps(record, indent=2))
 

@@ -152,20 +152,16 @@ def sections(section: type[Section] = Config) -> st.SearchStrategy:
 
 def scales(typical: float) -> st.SearchStrategy[Any]:
     """A hyperparameter around its typical value, now and then far from it, fixed or learned."""
-    median = st.one_of(
-        st.just(typical),
-        st.floats(0.1 * typical, 10 * typical),
-        st.sampled_from([1e-300, 1e-12, 1e-4, 1e4, 1e12, 1e300]),
-    )
-    learned = st.fixed_dictionaries(
-        {"median": median}, optional={"log_sd": st.sampled_from([0.01, 0.5, 2.0, 5.0])}
-    )
-    return st.one_of(median, learned)
+    usual = [typical] * 30 + [factor * typical for factor in (0.1, 0.3, 3.0, 10.0)] * 5
+    median = st.sampled_from([*usual, 1e-300, 1e-30, 1e-12, 1e-4, 1e4, 1e12, 1e30, 1e300])
+    log_sd = st.sampled_from([0.01, 0.5, 2.0, 5.0])
+    learned = st.fixed_dictionaries({"median": median}, optional={"log_sd": log_sd})
+    # The more there is to learn, the longer training takes.
+    return st.one_of(median, median, median, learned)
 
 
 LENGTHS = st.fixed_dictionaries(
-    {},
-    optional={"time": scales(0.5), "phase": scales(0.15), "position": scales(0.1), "velocity": scales(0.3)},
+    {"time": scales(0.5), "phase": scales(0.15), "position": scales(0.1), "velocity": scales(0.3)},
 )
 kinds = st.sampled_from(["time", "phase", "position", "velocity"])
 inputs = st.lists(kinds, max_size=2, unique=True)
@@ -183,30 +179,28 @@ def plausible_configurations(draw: Draw) -> Content:
         "kernel": st.sampled_from(
             ["squared_exponential", "rational_quadratic", "matern52", "matern72", "matern92"]
         ),
-        "sd": scales(0.02),
-        "length_scale": LENGTHS,
         "shape": scales(1.0),
         "value": st.dictionaries(st.sampled_from("xyz"), st.floats(-1, 1)),
         "average_knots": st.sampled_from([1, 6, 500]),
     }
-    trajectory |= draw(st.fixed_dictionaries({}, optional=options))
+    required: dict[str, st.SearchStrategy[Any]] = {"sd": scales(0.02), "length_scale": LENGTHS}
+    trajectory |= draw(st.fixed_dictionaries(required, optional=options))
     for name, typical in (("stiffness", 300.0), ("damping", 20.0)):
         gaussian = draw(st.sampled_from([False, False, True]))
-        options = {"level": scales(typical), "input": inputs, "length_scale": LENGTHS}
-        if not gaussian:
-            options["log_sd"] = st.floats(0.01, 0.5)
-        required = {"prior": st.just("gp"), "sd": scales(typical / 10)} if gaussian else {}
-        model[name] = draw(st.fixed_dictionaries(required, optional=options))
-    residual = {
-        "sd": scales(1.0),
-        "length_scale": LENGTHS,
-        "offset_sd": scales(0.5),
-        "input": some_inputs,
-    }
+        required = {"level": scales(typical), "length_scale": LENGTHS}
+        if gaussian:
+            required |= {"prior": st.just("gp"), "sd": scales(typical / 10)}
+        else:
+            required["log_sd"] = st.floats(0.01, 0.5)
+        model[name] = draw(st.fixed_dictionaries(required, optional={"input": inputs}))
+    model["noise_sd"] = draw(scales(0.2))
+    residual = st.fixed_dictionaries(
+        {"sd": scales(1.0), "length_scale": LENGTHS},
+        optional={"offset_sd": scales(0.5), "input": some_inputs},
+    )
+    model["residual"] = draw(st.none() | residual)
     whole: dict[str, st.SearchStrategy[Any]] = {
         "mass": st.fixed_dictionaries({}, optional={"level": scales(1.5), "sd": scales(0.3)}),
-        "residual": st.none() | st.fixed_dictionaries({}, optional=residual),
-        "noise_sd": scales(0.2),
     }
     if theta == "position_velocity":
         whole["drop_acceleration"] = st.booleans()
