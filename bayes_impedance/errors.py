@@ -18,7 +18,7 @@ class ModelFolderError(BayesImpedanceError):
 
 
 class NotPositiveDefiniteError(BayesImpedanceError):
-    """A covariance matrix has no Cholesky factor at the jitter that was tried."""
+    """A covariance matrix has no Cholesky factor at the jitter that was tried, or overflows."""
 
 
 class TooManySamplesError(BayesImpedanceError):

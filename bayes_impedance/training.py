@@ -97,7 +97,7 @@ def train(
     hyperprior. Interrupting (Ctrl-C) keeps the best found so far. What `journal` remembers is not computed again.
 
     Raises:
-        NotPositiveDefiniteError: no restart found a covariance that factorises, or a finite likelihood.
+        NotPositiveDefiniteError: no restart found a covariance that factorises and a finite likelihood.
     """
     search = _Search(model, features, jitter, journal)
     generator = np.random.default_rng(config.seed)
@@ -118,12 +118,12 @@ def train(
         if interrupted or not start.size:
             break
     if not np.isfinite(search.best_objective).all():
-        if interrupted and failure is None:
+        if failure is None:
             raise KeyboardInterrupt
-        if journal is not None and not interrupted:
+        if journal is not None:
             # Continuing would lead nowhere either.
             journal.remove()
-        raise failure or _nowhere_finite(search)
+        raise failure
     search.restore()
     log_sd: dict[str, list[list[float]]] = {}
     if not interrupted:
@@ -140,14 +140,6 @@ def train(
         log_sd=log_sd,
         interrupted=interrupted,
         samples=sum(len(rows) for rows in features.rows),
-    )
-
-
-def _nowhere_finite(search: _Search) -> NotPositiveDefiniteError:
-    count = int((~np.isfinite(search.best_objective)).sum())
-    return NotPositiveDefiniteError(
-        f"expected a finite likelihood somewhere, found none for {count} of {search.axes} axes in any restart; check "
-        "log.units, and that the medians under model are of the size that their unit lets expect"
     )
 
 
@@ -265,6 +257,11 @@ class _Search:
             gradient = np.concatenate(parts, axis=1)[:, self.free]
         else:
             gradient = np.zeros((self.axes, 0))
+        if not (bool(value.isfinite().all()) and np.isfinite(gradient).all()):
+            raise NotPositiveDefiniteError(
+                "expected a finite likelihood of the forces, found one that overflows, or its gradient does; check "
+                "log.units, and that the medians under model are of the size that their unit lets expect"
+            )
         return value.detach().numpy(), likelihood.detach().numpy(), gradient
 
     def __call__(self, point: Array) -> tuple[float, Array]:

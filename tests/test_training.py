@@ -177,18 +177,19 @@ def test_a_start_outside_the_bounds_is_brought_inside(log):
     assert np.isfinite(report.objective).all()
 
 
-# --- a likelihood that is nowhere finite -----------------------------------------------------------
+# --- a likelihood that is not finite --------------------------------------------------------------
 
 
-def test_likelihood_that_is_nowhere_finite_is_an_error_and_no_interruption(log, monkeypatch):
+@pytest.mark.parametrize("broken", ["value", "gradient"])
+def test_likelihood_that_is_nowhere_finite_is_an_error_and_no_interruption(log, monkeypatch, broken):
     def nowhere(model: ForceModel, *_: object) -> tuple[torch.Tensor, torch.Tensor]:
-        value = sum(entry.raw.sum() for entry in model.entries) * torch.full(
-            (1,), torch.nan, dtype=torch.float64
-        )
-        return value, value.detach()
+        raws = torch.stack([entry.raw.sum() for entry in model.entries])
+        # The slope of √|x| at 0 is not finite.
+        total = raws.sum() * torch.nan if broken == "value" else (raws - raws.detach()).abs().sqrt().sum()
+        return total.reshape(1), total.detach().reshape(1)
 
     monkeypatch.setattr(training, "objective", nowhere)
     with pytest.raises(
-        NotPositiveDefiniteError, match=r"found none for 1 of 1 axes in any restart; check log\.units"
+        NotPositiveDefiniteError, match=r"found one that overflows, or its gradient does; check log"
     ):
         ImpedanceModel(LEARNING).fit(log)
