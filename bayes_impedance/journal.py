@@ -50,6 +50,9 @@ class Journal:
                 "train with another --out"
             )
         self._identity, self._known, end = _read(content)
+        if not self._known:
+            # Nothing is lost by beginning anew, with whatever settings.
+            self._identity, end = None, 0
         file.truncate(end)
         self._synchronised = time.monotonic()
 
@@ -115,10 +118,16 @@ class Journal:
 
     def _write(self, content: bytes) -> None:
         assert self._file is not None
-        # A disk that fills up takes a part first, and only then refuses.
-        rest = memoryview(content)
-        while rest:
-            rest = rest[self._file.write(rest) :]
+        end = os.fstat(self._file.fileno()).st_size
+        try:
+            # A disk that fills up takes a part first, and only then refuses.
+            rest = memoryview(content)
+            while rest:
+                rest = rest[self._file.write(rest) :]
+        except BaseException:
+            # Ctrl-C included: what would come after half a record could not be read.
+            self._file.truncate(end)
+            raise
 
 
 @contextmanager

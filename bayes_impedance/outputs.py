@@ -95,7 +95,7 @@ def whole_folder(path: Path, marker: str) -> Iterator[Path]:
         temporary.chmod(0o777 & ~_umask())
         for file in temporary.iterdir():
             _synchronise(file)
-        _put_in_place(temporary, target, replaced)
+        _put_in_place(temporary, target, replaced, marker)
     except OSError as error:
         raise OutputError(f"{path}: could not be written: {error.strerror or error}") from error
     finally:
@@ -106,7 +106,7 @@ def whole_folder(path: Path, marker: str) -> Iterator[Path]:
         shutil.rmtree(replaced, ignore_errors=True)
 
 
-def _put_in_place(temporary: Path, target: Path, replaced: Path) -> None:
+def _put_in_place(temporary: Path, target: Path, replaced: Path, marker: str) -> None:
     """Give `temporary` the name `target`; what had it ends up as `temporary` or `replaced`."""
     if _exchange(temporary, target):
         return
@@ -115,8 +115,8 @@ def _put_in_place(temporary: Path, target: Path, replaced: Path) -> None:
             target.rename(replaced)
         temporary.rename(target)
     except OSError:
-        # Another process may have put its own folder there just now.
-        if not _exchange(temporary, target):
+        # Another process may have put a folder of the same kind there just now.
+        if not ((target / marker).is_file() and _exchange(temporary, target)):
             raise
 
 

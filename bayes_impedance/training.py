@@ -118,12 +118,9 @@ def train(
         if interrupted or not start.size:
             break
     if not np.isfinite(search.best_objective).all():
-        if failure is None:
-            raise KeyboardInterrupt
-        if journal is not None:
-            # Continuing would lead nowhere either.
-            journal.remove()
-        raise failure
+        if failure is not None:
+            raise failure
+        raise KeyboardInterrupt
     search.restore()
     log_sd: dict[str, list[list[float]]] = {}
     if not interrupted:

@@ -189,6 +189,17 @@ def test_journal_of_another_training_is_refused(path, change, said):
     assert path.read_bytes() == before
 
 
+def test_without_an_evaluation_it_is_of_no_training(path):
+    fill(path, 1)
+    path.write_bytes(path.read_bytes()[:-1])
+    with open_journal(path) as journal:
+        journal.begin({"torch": "2.14"})
+        journal.keep(np.zeros(2), np.zeros(3))
+    with open_journal(path) as journal:
+        journal.begin({"torch": "2.14"})
+        assert len(journal) == 1
+
+
 def test_full_disk_before_the_work_begins(path, full_disk):
     long = ABOUT | {"recordings": "x" * 5000}
     with (
@@ -216,6 +227,33 @@ def test_full_disk_later_is_one_warning(path, full_disk):
     assert contents(path) == list(range(10))
     with open_journal(path) as journal:
         assert len(journal) == (4096 - len(MAGIC) - len(json.dumps(ABOUT)) - 1) // (RECORD.size + 8 * 5)
+
+
+def test_interrupted_in_the_middle_of_a_record_it_goes_on_behind_the_last_whole_one(path):
+    class Interrupting:
+        """A file that takes ten bytes, and then Ctrl-C comes."""
+
+        def __init__(self, file):
+            self.file, self.calls = file, 0
+
+        def write(self, content):
+            self.calls += 1
+            if self.calls == 2:
+                raise KeyboardInterrupt
+            return self.file.write(content[:10])
+
+        def __getattr__(self, name):
+            return getattr(self.file, name)
+
+    fill(path, 2)
+    with open_journal(path) as journal:
+        journal.begin(ABOUT)
+        file, journal._file = journal._file, Interrupting(journal._file)
+        with pytest.raises(KeyboardInterrupt):
+            journal.keep(np.array([2, np.pi]), np.array([2.1, -np.inf, np.nan]))
+        journal._file = file
+        journal.keep(np.array([3, np.pi]), np.array([3.1, -np.inf, np.nan]))
+    assert contents(path) == [0, 1, 3]
 
 
 # --- training ------------------------------------------------------------------------------------

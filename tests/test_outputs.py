@@ -5,6 +5,7 @@ import os
 import shutil
 import stat
 import tempfile
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -269,19 +270,23 @@ def test_one_folder_stands_there_when_two_are_put_in_place_at_once(tmp_path, mon
     assert content(tmp_path) == {f"model/{MARKER}": "one"}
 
 
-def test_folder_that_appears_at_the_last_moment_is_replaced(tmp_path, monkeypatch):
+@pytest.mark.parametrize("kind", [MARKER, "thesis.tex"])
+def test_folder_that_appears_at_the_last_moment_is_replaced_if_it_is_of_the_same_kind(
+    tmp_path, monkeypatch, kind
+):
     path = tmp_path / "model"
     rename = Path.rename
 
     def late(self: Path, target: Path) -> Path:
         path.mkdir()
-        (path / MARKER).write_text("another process")
+        (path / kind).write_text("another process")
         return rename(self, target)
 
     monkeypatch.setattr(Path, "rename", late)
-    with whole_folder(path, MARKER) as place:
+    refused = pytest.raises(OutputError, match="could not be written: Directory not empty")
+    with nullcontext() if kind == MARKER else refused, whole_folder(path, MARKER) as place:
         (place / MARKER).write_text("mine")
-    assert content(tmp_path) == {f"model/{MARKER}": "mine"}
+    assert content(tmp_path) == {f"model/{kind}": "mine" if kind == MARKER else "another process"}
 
 
 def test_old_folder_that_cannot_be_removed_does_not_spoil_the_new_one(tmp_path, old, monkeypatch):
