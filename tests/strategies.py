@@ -180,7 +180,7 @@ def plausible_configurations(draw: Draw) -> Content:
             ["squared_exponential", "rational_quadratic", "matern52", "matern72", "matern92"]
         ),
         "shape": scales(1.0),
-        "value": st.dictionaries(st.sampled_from("xyz"), st.floats(-1, 1)),
+        "value": st.dictionaries(st.sampled_from("xyz"), st.floats(-1, 1) | st.sampled_from([1e155, -1e300])),
         "average_knots": st.sampled_from([1, 2, 3, 6, 500]),
     }
     required: dict[str, st.SearchStrategy[Any]] = {"sd": scales(0.02), "length_scale": LENGTHS}
@@ -205,20 +205,36 @@ def plausible_configurations(draw: Draw) -> Content:
     if theta == "position_velocity":
         whole["drop_acceleration"] = st.booleans()
     model |= draw(st.fixed_dictionaries({}, optional=whole))
-    smoother = {"window": st.sampled_from([0.02, 0.1, 0.2, 0.3, 30.0]), "polynomial_order": st.integers(3, 7)}
+    smoother = {
+        "window": st.sampled_from([0.02, 0.1, 0.1, 0.2, 0.2, 0.3, 30.0, 1e300, 1e-320]),
+        "polynomial_order": st.integers(3, 7),
+    }
     preprocessing = {
         "smoother": st.none() | st.fixed_dictionaries({}, optional=smoother),
-        "rate": st.sampled_from([None, None, 5, 10, 20, 1e-6]),
-        "max_gap": st.sampled_from([0.04, 0.5, 0.5, 1.0, 1e9]),
+        "rate": st.sampled_from([None, None, None, 5, 10, 10, 20, 1e-6, 1e-320, 1e300]),
+        "max_gap": st.sampled_from([0.04, 0.5, 0.5, 1.0, 1e9, 1e300, 1e-320]),
     }
     log = {
         "axes": st.sampled_from([None] * 8 + [["x"], ["y", "x"], ["z"]]),
         "units": st.fixed_dictionaries(
-            {}, optional={"time": st.sampled_from(["s", "ms"]), "position": st.sampled_from(["m", "mm"])}
+            {},
+            optional={
+                "time": st.sampled_from(["s", "s", "ms", "ns"]),
+                "position": st.sampled_from(["m", "mm"]),
+            },
         ),
         "force_direction": st.sampled_from(["human_on_robot", "robot_on_human"]),
         "window": st.sampled_from(
-            [{}, {}, {}, {"start": 0.1}, {"end": 0.5}, {"start": 0.3, "end": 0.31}, {"start": 1e9}]
+            [
+                {},
+                {},
+                {},
+                {"start": 0.1},
+                {"end": 0.5},
+                {"start": 0.3, "end": 0.31},
+                {"start": 1e9},
+                {"start": -1e300, "end": 1e300},
+            ]
         ),
         "columns": st.sampled_from(
             [{}, {"velocity": None, "acceleration": None}, {"phase": None}, {"trial": "group"}]
@@ -237,6 +253,13 @@ def plausible_configurations(draw: Draw) -> Content:
             optional={
                 "jitter": st.sampled_from([0, 1e-12, 1e-6, 1e-3]),
                 "max_samples": st.sampled_from([2, 30, 100, 1000, 4000]),
+            },
+        ),
+        "training": st.fixed_dictionaries(
+            {},
+            optional={
+                "seed": st.integers(0, 2**70),
+                "gradient_tolerance": st.sampled_from([1e-320, 1e-3, 1e300]),
             },
         ),
         "baseline": st.fixed_dictionaries({}, optional={"input": st.none() | some_inputs}),

@@ -138,6 +138,12 @@ def hole(bench: Bench) -> Arguments:
     return bench.train(bench.write(table.drop(index=range(20, 60))))
 
 
+def three_years(bench: Bench) -> Arguments:
+    table = bench.table()
+    table.loc[99, "time"] = 1e8
+    return bench.train(bench.write(table), settings=("preprocessing.max_gap=1e9",))
+
+
 def unseen_group(bench: Bench) -> Arguments:
     return bench.infer(bench.write(bench.table().assign(group="left arm")))
 
@@ -330,12 +336,27 @@ CASES: dict[str, tuple[Callable[[Bench], Arguments], tuple[str, ...]]] = {
             r"cut there with log\.window, or raise preprocessing\.max_gap",
         ),
     ),
+    "gap of three years that is allowed": (
+        three_years,
+        (
+            r"bad\.csv, trial '0': expected a log without long gaps, found 100 samples that would have to be",
+            r"filled up to 5e\+09 at steps of 0\.02 s; cut the gaps with log\.window, or lower preprocessing\.max_gap",
+        ),
+    ),
     "rate above the native one": (
         configured("preprocessing.rate=500"),
         (
             r"log\.csv, trial '0': expected preprocessing\.rate of at most the native rate, 50 Hz",
             r"found 500 Hz; lower it",
         ),
+    ),
+    "window of the smoother beyond all time": (
+        configured("preprocessing.smoother.window=1e300"),
+        (r"log\.csv, trial '0': expected at least 2000000001 samples, one window of the smoother \(4e\+07 s\)",),
+    ),
+    "rate that leaves one sample": (
+        configured("preprocessing.rate=1e-320", "model.desired_trajectory.average_knots=1"),
+        (r"group '0': expected samples between any two of the 1 knots of the trial average", "among 2 samples"),
     ),
     "nothing in the window": (
         configured("log.window.start=100"),
