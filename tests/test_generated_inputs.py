@@ -26,13 +26,13 @@ QUICK = {
 }
 
 
-@settings(max_examples=200, **QUICK)
+@settings(max_examples=150, **QUICK)
 @given(cases())
 def test_commands_end_well_or_in_one_sentence(case: Case) -> None:
     follow(case)
 
 
-@settings(max_examples=200, **QUICK)
+@settings(max_examples=150, **QUICK)
 @given(configuration_files(spoilt=False))
 def test_plausible_configurations_make_a_model_or_are_refused(tmp_path_factory, content: bytes) -> None:
     path = tmp_path_factory.getbasetemp() / "plausible.yaml"
