@@ -8,10 +8,10 @@ INSTALLED := $(VENV)/.installed
 SOURCES := bayes_impedance tests benchmarks docs conftest.py
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint types format bench results docs hooks clean
+.PHONY: help demo test lint types format bench results docs faults hooks clean
 
 help:
-	@sed -n '1,2p' Makefile; echo "also: lint types format bench results docs hooks clean"
+	@sed -n '1,2p' Makefile; echo "also: lint types format bench results docs faults hooks clean"
 
 $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -53,6 +53,10 @@ results: $(INSTALLED)
 # The API reference, from the docstrings, in docs/api/.
 docs: $(INSTALLED)
 	$(BIN)/python docs/reference docs/api
+
+# Five thousand generated inputs; writes results/faults.json unless one ends in a traceback.
+faults: $(INSTALLED)
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.generated_inputs
 
 hooks: $(INSTALLED)
 	$(BIN)/pre-commit install

@@ -22,9 +22,16 @@ from bayes_impedance.contenders import Baseline
 from bayes_impedance.cross_validation import as_json as folds_as_json
 from bayes_impedance.cross_validation import cross_validate
 from bayes_impedance.demo import record, truth_errors
-from bayes_impedance.errors import BayesImpedanceError, ConfigurationError, LogError, LogWarning, OutputError
+from bayes_impedance.errors import (
+    BayesImpedanceError,
+    BayesImpedanceWarning,
+    ConfigurationError,
+    LogError,
+    OutputError,
+)
 from bayes_impedance.evaluation import as_json, evaluate
 from bayes_impedance.identifiability import summarise
+from bayes_impedance.journal import open_journal
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.outputs import check_replaceable, check_writable, prepare_folder, whole_file
@@ -174,31 +181,54 @@ def train(
             "--set", metavar="KEY=VALUE", help="Change one key, e.g. training.restarts=5; repeatable."
         ),
     ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue a training that was killed or stopped.")
+    ] = False,
 ) -> None:
     """Train hyperparameters on recordings (MAP of the marginal likelihood) and write the model.
 
-    Ctrl-C stops early and keeps the best found so far.
+    Ctrl-C stops early and keeps the best found so far. What was computed is kept beside the model until training has
+    ended: after Ctrl-C, a crash or a power cut the same command with --resume continues, and ends with the same model.
     """
     console = Console()
     settings = load_config(config, overrides or [])
     check_writable(out)
     check_replaceable(out, METADATA)
-    log = read_log(logs, settings.log)
-    model = ImpedanceModel(settings)
-    prepared = model.prepare(log)
-    console.print(
-        f"training on {prepared.n_samples} samples of {len(prepared.trials)} trials, axes {', '.join(prepared.axes)}"
-    )
-    with terminal.training_progress(console, settings.training, "training") as progress:
-        model = model.fit(prepared, progress)
-    save_model(model, out)
+    with open_journal(_journal_of(out)) as journal:
+        if journal and not resume:
+            raise OutputError(
+                f"{journal.path}: expected no unfinished training of {out.name}, found one with {len(journal)} "
+                "evaluations; add --resume to continue it, or delete the file to start anew"
+            )
+        log = read_log(logs, settings.log)
+        model = ImpedanceModel(settings)
+        prepared = model.prepare(log)
+        console.print(
+            f"training on {prepared.n_samples} samples of {len(prepared.trials)} trials, axes "
+            f"{', '.join(prepared.axes)}"
+        )
+        if resume:
+            console.print(
+                f"continuing after {len(journal)} evaluations"
+                if journal
+                else "nothing to resume: training from the start"
+            )
+        with terminal.training_progress(console, settings.training, "training") as progress:
+            model = model.fit(prepared, progress, journal=journal)
+        save_model(model, out)
+        if not model.report.interrupted:
+            journal.remove()
     console.print(terminal.restart_table(model))
     terminal.print_verdicts(console, model, model.posterior(model.fitted.log))
     console.print(
         f"wrote {out}; look at it with: bayes-impedance show {out}", highlight=False, soft_wrap=True
     )
     if model.report.interrupted:
-        console.print("training was interrupted: the model holds the best hyperparameters found until then")
+        console.print(
+            "training was interrupted: the model holds the best hyperparameters found until then; to continue, add "
+            "--resume to the same command",
+            soft_wrap=True,
+        )
         raise typer.Exit(INTERRUPTED)
 
 
@@ -360,6 +390,11 @@ def _others(sources: Sequence[str]) -> dict[str, ImpedanceModel]:
     return others
 
 
+def _journal_of(model: Path) -> Path:
+    target = model.resolve()
+    return target.with_name(f"{target.name}.journal")
+
+
 def _posterior_format(path: Path) -> str:
     if path.suffix not in (".csv", ".parquet"):
         raise OutputError(
@@ -389,5 +424,5 @@ def _errors() -> Console:
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
     """Our warnings in one sentence; those of libraries are no news to the user."""
-    if issubclass(category, LogWarning):
+    if issubclass(category, BayesImpedanceWarning):
         _errors().print(f"[yellow]warning:[/yellow] {escape(str(message))}", highlight=False, soft_wrap=True)

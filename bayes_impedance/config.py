@@ -38,6 +38,9 @@ LARGEST_LOG_SD = 0.5
 #: Widest log-SD of a hyperprior.
 LARGEST_HYPERPRIOR_LOG_SD = 5.0
 
+#: Far beyond what makes sense in any unit, so that squares and products of medians stay within float64.
+MEDIANS = (1e-30, 1e30)
+
 #: What PyYAML raises at a text that it cannot turn into values (13 months, a thousand brackets).
 UNREADABLE = (yaml.YAMLError, ValueError, RecursionError)
 
@@ -58,6 +61,15 @@ class Hyperparameter(Section):
     median: float = Field(gt=0)
     log_sd: float = Field(default=1.0, gt=0, le=LARGEST_HYPERPRIOR_LOG_SD)
     fixed: bool = False
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        low, high = MEDIANS
+        if not low <= self.median <= high:
+            raise ValueError(
+                f"median: expected between {low:g} and {high:g}, got {self.median:g}; check its unit"
+            )
+        return self
 
 
 def _number_means_fixed(value: Any) -> Any:

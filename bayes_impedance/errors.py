@@ -18,7 +18,7 @@ class ModelFolderError(BayesImpedanceError):
 
 
 class NotPositiveDefiniteError(BayesImpedanceError):
-    """A covariance matrix has no Cholesky factor at the jitter that was tried."""
+    """A covariance matrix has no Cholesky factor at the jitter that was tried, or overflows."""
 
 
 class TooManySamplesError(BayesImpedanceError):
@@ -29,5 +29,13 @@ class OutputError(BayesImpedanceError):
     """An output file or folder cannot be written."""
 
 
-class LogWarning(UserWarning):
+class BayesImpedanceWarning(UserWarning):
+    """Base of every warning that a user should read."""
+
+
+class LogWarning(BayesImpedanceWarning):
     """The recording can be used, but something in it looks wrong."""
+
+
+class JournalWarning(BayesImpedanceWarning):
+    """Training goes on, but could not be continued from here if it were killed."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 
@@ -18,6 +19,7 @@ from bayes_impedance.engines.pointwise import PointPredictor
 from bayes_impedance.errors import ConfigurationError, LogError
 from bayes_impedance.features import FeatureMap, check_combination, count_repetitions, label_trials, trial_key
 from bayes_impedance.identifiability import Verdict, assess, was_perturbed
+from bayes_impedance.journal import Journal
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.log import InteractionLog
 from bayes_impedance.posterior import Posterior, compute_posterior
@@ -113,14 +115,17 @@ class ImpedanceModel:
         log: InteractionLog | PreparedLog,
         progress: Progress | None = None,
         start: ImpedanceModel | None = None,
+        journal: Journal | None = None,
     ) -> ImpedanceModel:
         """A new model with hyperparameters trained on `log` (MAP of the marginal likelihood).
 
         The first restart begins at the values of `start`, a fitted model with the same hyperparameters, where one is
-        given; such a refit has no Laplace approximation.
+        given; such a refit has no Laplace approximation. `journal` keeps every evaluation, and a training that was
+        killed continues from it to the same bits.
 
         Raises:
             LogError, ConfigurationError, TooManySamplesError, NotPositiveDefiniteError.
+            OutputError: the journal is of another training, or cannot be written.
         """
         prepared = ImpedanceModel(self.config).prepare(log)
         feature_map = FeatureMap(self.config, prepared.axes)
@@ -131,10 +136,18 @@ class ImpedanceModel:
         force_model = build_force_model(self.config, feature_map)
         if start is not None:
             force_model.start_at(start.hyperparameters)
-        warm = start is not None
+        if journal is not None:
+            journal.begin(self._objective_of(prepared))
         report = train(
-            force_model, features, self.config.training, self.config.engine.jitter, progress, warm, laplace=not warm
-        )  # fmt: skip
+            force_model,
+            features,
+            self.config.training,
+            self.config.engine.jitter,
+            progress,
+            warm=start is not None,
+            laplace=start is None,
+            journal=journal,
+        )
         return ImpedanceModel(self.config, Fit(force_model, prepared, report))
 
     def posterior(
@@ -243,6 +256,15 @@ class ImpedanceModel:
         if self._fit is not None:
             return copy.deepcopy(self._fit.force_model)
         return build_force_model(self.config, feature_map)
+
+    def _objective_of(self, log: PreparedLog) -> dict[str, object]:
+        """All that the objective of training depends on; `training` says only where it is evaluated."""
+        return {
+            "bayes_impedance": version("bayes-impedance"),
+            "torch": version("torch"),
+            "configuration": self.config.model_dump(mode="json", exclude={"training", "baseline"}),
+            "recordings": log.fingerprint()[:16],
+        }
 
     def _mean(self, log: PreparedLog) -> TrajectoryMean:
         """Prior mean of x_d, learned from the training log where there is one, else from `log` itself."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -66,6 +68,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     try:
         yield temporary
         temporary.chmod(0o666 & ~_umask())
+        _synchronise(temporary)
         temporary.replace(target)
     except OSError as error:
         raise OutputError(f"{path}: could not be written: {error.strerror or error}") from error
@@ -90,9 +93,9 @@ def whole_folder(path: Path, marker: str) -> Iterator[Path]:
     try:
         yield temporary
         temporary.chmod(0o777 & ~_umask())
-        if target.is_dir():
-            target.rename(replaced)
-        temporary.rename(target)
+        for file in temporary.iterdir():
+            _synchronise(file)
+        _put_in_place(temporary, target, replaced, marker)
     except OSError as error:
         raise OutputError(f"{path}: could not be written: {error.strerror or error}") from error
     finally:
@@ -101,6 +104,35 @@ def whole_folder(path: Path, marker: str) -> Iterator[Path]:
             replaced.rename(target)
         shutil.rmtree(temporary, ignore_errors=True)
         shutil.rmtree(replaced, ignore_errors=True)
+
+
+def _put_in_place(temporary: Path, target: Path, replaced: Path, marker: str) -> None:
+    """Give `temporary` the name `target`; what had it ends up as `temporary` or `replaced`."""
+    if _exchange(temporary, target):
+        return
+    try:
+        if target.is_dir():
+            target.rename(replaced)
+        temporary.rename(target)
+    except OSError:
+        # Another process may have put a folder of the same kind there just now.
+        if not ((target / marker).is_file() and _exchange(temporary, target)):
+            raise
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Swap two names in one step, so that no kill comes between; False where a name is free or the system cannot."""
+    if sys.platform != "linux":
+        return False
+    rename = getattr(ctypes.CDLL(None), "renameat2", None)
+    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+    return rename is not None and rename(here, os.fsencode(one), here, os.fsencode(other), exchange) == 0
+
+
+def _synchronise(file: Path) -> None:
+    """To the disk, before the name is: after a power cut a name without content would be a half-written file."""
+    with file.open("r+b") as opened:
+        os.fsync(opened.fileno())
 
 
 def check_replaceable(path: Path, marker: str) -> None:

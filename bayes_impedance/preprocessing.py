@@ -36,6 +36,10 @@ Orders = tuple[Array, Array, Array]
 
 #: Steps that differ from the median by more than this share of it make a trial unevenly sampled.
 UNEVEN = 0.01
+#: Samples of half a window; a number that does not overflow, and that no log has.
+LONGEST = 1e9
+#: Samples that interpolation may put in place of one; more are a gap that `max_gap` was raised above.
+MOST_FILLED = 1000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -209,7 +213,14 @@ def _repetitions(trial: Trial) -> Iterator[slice]:
 def _on_even_grid(trial: Trial, step: float) -> Trial:
     """`trial` interpolated to steps of `step` [s]: monotone cubics, which do not overshoot."""
     time = trial.time
-    grid = time[0] + step * np.arange(math.floor((time[-1] - time[0]) / step + 1e-9) + 1)
+    count = math.floor((time[-1] - time[0]) / step + 1e-9) + 1
+    if count > MOST_FILLED * trial.n_samples:
+        raise LogError(
+            f"{_at(trial)}: expected a log without long gaps, found {trial.n_samples} samples that would have to be "
+            f"filled up to {count:.3g} at steps of {step:g} s; cut the gaps with log.window, or lower "
+            "preprocessing.max_gap to find them"
+        )
+    grid = time[0] + step * np.arange(count)
     grid = np.minimum(grid, time[-1])
     before = np.clip(np.searchsorted(time, grid, side="right") - 1, 0, trial.n_samples - 2)
     # Between two repetitions the nearer sample decides; elsewhere both have one label.
@@ -277,7 +288,7 @@ class _SavitzkyGolay:
 
 def _filter(trial: Trial, smoother: Smoother, step: float) -> _SavitzkyGolay:
     # The odd number nearest to window / step.
-    length = 2 * math.floor(smoother.window / step / 2 + 1e-9) + 1
+    length = 2 * math.floor(min(smoother.window / step / 2, LONGEST) + 1e-9) + 1
     # With order + 1 samples the polynomial passes through every one of them and smooths nothing.
     if length <= smoother.polynomial_order + 1:
         length = smoother.polynomial_order + 2
@@ -420,7 +431,8 @@ def _thinned(trial: PreparedTrial, step: float, rate: float | None) -> PreparedT
             f"{_at(trial)}: expected preprocessing.rate of at most the native rate, {1 / step:.4g} Hz, found "
             f"{rate:g} Hz; lower it or leave it out"
         )
-    every = max(1, round(1 / (step * rate)))
+    # However low the rate, the first sample stays.
+    every = max(1, round(1 / max(step * rate, 1 / trial.n_samples)))
     changes: dict[str, Any] = {
         name: value[::every] for name in _ARRAYS if (value := getattr(trial, name)) is not None
     }

@@ -21,6 +21,7 @@ from bayes_impedance.engines.closed_loop import log_likelihood
 from bayes_impedance.engines.dense import Observations
 from bayes_impedance.errors import NotPositiveDefiniteError
 from bayes_impedance.features import Features
+from bayes_impedance.journal import Journal
 from bayes_impedance.priors import Entry, ForceModel
 
 Array = NDArray[np.float64]
@@ -96,17 +97,18 @@ def train(
     progress: Progress | None = None,
     warm: bool = False,
     laplace: bool = True,
+    journal: Journal | None = None,
 ) -> TrainingReport:
     """Set the hyperparameters of `model` to their MAP estimate; deterministic under `config.seed`.
 
     Restart 0 starts at the hyperprior medians or, when `warm`, where `model` stands; the others at draws from the
     hyperprior. Interrupting (Ctrl-C) keeps the best found so far. Without `laplace` the report holds no `log_sd`, which
-    takes two evaluations a hyperparameter.
+    takes two evaluations a hyperparameter. What `journal` remembers is not computed again.
 
     Raises:
-        NotPositiveDefiniteError: no restart found a covariance that factorises.
+        NotPositiveDefiniteError: no restart found a covariance that factorises and a finite likelihood.
     """
-    search = _Search(model, features, jitter)
+    search = _Search(model, features, jitter, journal)
     generator = np.random.default_rng(config.seed)
     reports: list[RestartReport] = []
     interrupted = False
@@ -171,8 +173,8 @@ def _climb(search: _Search, start: Array, config: TrainingConfig) -> str:
 class _Search:
     """The objective as scipy sees it: a function of one vector, the free unconstrained values by axis."""
 
-    def __init__(self, model: ForceModel, features: Features, jitter: float) -> None:
-        self.model, self.features, self.jitter = model, features, jitter
+    def __init__(self, model: ForceModel, features: Features, jitter: float, journal: Journal | None) -> None:
+        self.model, self.features, self.jitter, self.journal = model, features, jitter, journal
         self.entries: list[Entry] = [entry for entry in model.entries if bool(entry.free.any())]
         self.axes = features.inputs.shape[0]
         free = [entry.free.numpy() for entry in self.entries]
@@ -234,7 +236,21 @@ class _Search:
         return np.asarray(np.clip(point, lower, upper))
 
     def evaluate(self, point: Array) -> tuple[Array, Array, Array]:
-        """Objective and likelihood `(axes,)`, gradient of the objective `(axes, free)`."""
+        """Objective and likelihood `(axes,)`, gradient of the objective `(axes, free)`, known or computed."""
+        known = None if self.journal is None else self.journal.find(point)
+        if known is not None:
+            return (
+                known[: self.axes],
+                known[self.axes : 2 * self.axes],
+                known[2 * self.axes :].reshape(self.axes, -1),
+            )
+        computed = self.compute(point)
+        if self.journal is not None:
+            self.journal.keep(point, np.concatenate([part.reshape(-1) for part in computed]))
+        return computed
+
+    def compute(self, point: Array) -> tuple[Array, Array, Array]:
+        """What `evaluate` returns, from the covariance."""
         self.unpack(point)
         raws = [entry.raw for entry in self.entries]
         for raw in raws:
@@ -247,6 +263,11 @@ class _Search:
             gradient = np.concatenate(parts, axis=1)[:, self.free]
         else:
             gradient = np.zeros((self.axes, 0))
+        if not (bool(value.isfinite().all()) and np.isfinite(gradient).all()):
+            raise NotPositiveDefiniteError(
+                "expected a finite likelihood of the forces, found one that overflows, or its gradient does; check "
+                "log.units, and that the medians under model are of the size that their unit lets expect"
+            )
         return value.detach().numpy(), likelihood.detach().numpy(), gradient
 
     def __call__(self, point: Array) -> tuple[float, Array]:

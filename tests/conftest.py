@@ -12,7 +12,7 @@ import pytest
 
 from bayes_impedance.config import Config, load_config, parse_config
 from bayes_impedance.demo import TRUTH, write_log
-from bayes_impedance.errors import LogWarning
+from bayes_impedance.errors import BayesImpedanceWarning
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.persistence import save_model
 from bayes_impedance.readers import read_log
@@ -112,7 +112,7 @@ def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
         code = 0
         with warnings.catch_warnings():
             # A command prints our warnings; elsewhere in the tests they are errors like any other.
-            warnings.simplefilter("default", LogWarning)
+            warnings.simplefilter("default", BayesImpedanceWarning)
             try:
                 main()
             except SystemExit as exit_:

@@ -8,14 +8,18 @@ import json
 import re
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from bayes_impedance.errors import ConfigurationError, LogError
+from bayes_impedance.log import InteractionLog
 from bayes_impedance.persistence import METADATA
+from bayes_impedance.readers import read_log
+from conftest import Tiny
 
 Arguments = list[object]
 
@@ -137,6 +141,12 @@ def hole(bench: Bench) -> Arguments:
     return bench.train(bench.write(table.drop(index=range(20, 60))))
 
 
+def three_years(bench: Bench) -> Arguments:
+    table = bench.table()
+    table.loc[99, "time"] = 1e8
+    return bench.train(bench.write(table), settings=("preprocessing.max_gap=1e9",))
+
+
 def unseen_group(bench: Bench) -> Arguments:
     return bench.infer(bench.write(bench.table().assign(group="left arm")))
 
@@ -149,6 +159,12 @@ def no_force(given: str) -> Callable[[Bench], Arguments]:
         return [*bench.infer(bare), "--given", given]
 
     return arrange
+
+
+def booleans(bench: Bench) -> Arguments:
+    path = bench.folder / "bad.parquet"
+    bench.table().assign(force_x=True).to_parquet(path)
+    return bench.train(path)
 
 
 def no_model(bench: Bench) -> Arguments:
@@ -323,12 +339,27 @@ CASES: dict[str, tuple[Callable[[Bench], Arguments], tuple[str, ...]]] = {
             r"cut there with log\.window, or raise preprocessing\.max_gap",
         ),
     ),
+    "gap of three years that is allowed": (
+        three_years,
+        (
+            r"bad\.csv, trial '0': expected a log without long gaps, found 100 samples that would have to be",
+            r"filled up to 5e\+09 at steps of 0\.02 s; cut the gaps with log\.window, or lower preprocessing\.max_gap",
+        ),
+    ),
     "rate above the native one": (
         configured("preprocessing.rate=500"),
         (
             r"log\.csv, trial '0': expected preprocessing\.rate of at most the native rate, 50 Hz",
             r"found 500 Hz; lower it",
         ),
+    ),
+    "window of the smoother beyond all time": (
+        configured("preprocessing.smoother.window=1e300"),
+        (r"log\.csv, trial '0': expected at least 2000000001 samples, one window of the smoother \(4e\+07 s\)",),
+    ),
+    "rate that leaves one sample": (
+        configured("preprocessing.rate=1e-320", "model.desired_trajectory.average_knots=1"),
+        (r"group '0': expected samples between any two of the 1 knots of the trial average", "among 2 samples"),
     ),
     "nothing in the window": (
         configured("log.window.start=100"),
@@ -344,6 +375,14 @@ CASES: dict[str, tuple[Callable[[Bench], Arguments], tuple[str, ...]]] = {
             r"bad\.csv, trial '0', column phase: expected phase to increase strictly within a repetition",
             r"found 0\.2 .*; label repetitions .*, and cut pauses",
         ),
+    ),
+    "booleans for numbers": (
+        booleans,
+        (r"bad\.parquet, column 'force_x': expected numbers, found 'True' at row 1, of type bool; convert the column",),
+    ),
+    "forces beyond all numbers": (
+        changed(force_x=lambda force: 1e200 * force),
+        (r"expected a finite likelihood of the forces, found one that overflows, .*; check log\.units, and that",),
     ),
     # --- axes and columns that the model needs
     "axes that differ between files": (
@@ -387,6 +426,13 @@ CASES: dict[str, tuple[Callable[[Bench], Arguments], tuple[str, ...]]] = {
         configured("model.desired_trajectory.mean=constant", "model.desired_trajectory.value={x: 0.1}"),
         (r"desired_trajectory\.value: expected a position \[m\] for each of x, y, found none for y; add it",),
     ),
+    "more knots than samples": (
+        configured("model.desired_trajectory.average_knots=500"),
+        (
+            r"group '0': expected samples between any two of the 500 knots of the trial average over phase",
+            r"found an empty stretch among 40 samples; lower desired_trajectory\.average_knots",
+        ),
+    ),
     "no force to condition on": (no_force("log"), (r"bad\.csv: expected column 'force_x', found none",)),
     "no force to score": (no_force("evaluate"), (r"bad\.csv: expected column 'force_x'", r"set log\.columns\.force")),
     # --- configuration
@@ -409,6 +455,10 @@ CASES: dict[str, tuple[Callable[[Bench], Arguments], tuple[str, ...]]] = {
     "value out of range": (
         configured("training.restarts=0"),
         (r"training\.restarts: expected a valid value \(input should be greater than or equal to 1\), got 0",),
+    ),
+    "median beyond any unit": (
+        configured("model.noise_sd=1e300"),
+        (r"model\.noise_sd: median: expected between 1e-30 and 1e\+30, got 1e\+300; check its unit",),
     ),
     "too wide a log-normal": (
         configured("model.stiffness.log_sd=2"),
@@ -544,6 +594,14 @@ CASES: dict[str, tuple[Callable[[Bench], Arguments], tuple[str, ...]]] = {
         lambda bench: bench.infer(out=Path("/proc/out.csv")),
         (r"/proc/out\.csv: expected a writable folder /proc, got: .*; choose another place",),
     ),
+    "model in a folder that takes none": (
+        lambda bench: [*bench.train()[:-1], Path("/proc/model")],
+        (r"/proc/model: expected a writable folder /proc, got: .*; choose another place",),
+    ),
+    "file in place of the journal": (
+        lambda bench: [*bench.train(), "--resume"] if bench.text("mine", "out.journal") else [],
+        (r"out\.journal: expected the journal of a training, found another file; rename it, or train with another",),
+    ),
     "folder of somebody else": (
         other_folder,
         (r"out: expected a new folder.*found a folder with other content; choose another",),
@@ -588,3 +646,38 @@ def test_unit_that_moves_a_hand_too_far_is_a_warning(bench, command, factor, sai
         assert line.startswith(f"warning: bad.csv: position_{axis} spans ")
         assert line.endswith(f"units that make a hand move {said}; check log.units.position")
     assert (bench.out / METADATA).is_file()
+
+
+# --- in Python -----------------------------------------------------------------------------------
+
+
+def bare(tiny: Tiny) -> InteractionLog:
+    log = read_log(tiny.other, tiny.config.log)
+    return InteractionLog(log.axes, tuple(replace(trial, force=None) for trial in log.trials))
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "expected"),
+    [
+        (
+            lambda tiny: tiny.fitted.point_predictor("z", "0"),
+            ConfigurationError,
+            "expected an axis among x, y and a group among 0, got axis 'z' and group '0'",
+        ),
+        (
+            lambda tiny: tiny.fitted.log_marginal_likelihood(bare(tiny)),
+            LogError,
+            r"expected a log with force, found none; name log\.columns\.force",
+        ),
+        (
+            lambda tiny: InteractionLog.from_arrays(
+                [0, 1, 2], [0, 1, 2], [1, 2, 3], axes=["x"], phase=[0, 1]
+            ),
+            LogError,
+            r"column phase: expected shape \(3,\), as many rows as time has, found \(2,\); give one value a sample",
+        ),
+    ],
+)
+def test_bad_input_in_python(tiny, call, error, expected):
+    with pytest.raises(error, match=expected):
+        call(tiny)

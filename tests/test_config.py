@@ -7,13 +7,12 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from strategies import configurations, keys, names, sections, yamlish
 
 from bayes_impedance.config import (
     Config,
     DeviceConfig,
     Hyperparameter,
-    LengthScales,
-    Section,
     dump_config,
     load_config,
     parse_config,
@@ -26,23 +25,6 @@ SHIPPED = shipped_configurations()
 
 
 #: Keys that time.yaml does not show: they act only with another kernel, mean, prior or input.
-def keys(section: type[Section], prefix: str = "") -> set[str]:
-    """Dotted keys of the schema; a hyperparameter, its length scales and a section that is absent count as one."""
-    found = set()
-    for name, entry in section.model_fields.items():
-        inner = [
-            kind
-            for kind in (entry.annotation, *getattr(entry.annotation, "__args__", ()))
-            if isinstance(kind, type) and issubclass(kind, Section)
-        ]
-        absent = entry.default is None
-        if inner and not absent and not issubclass(inner[0], (Hyperparameter, LengthScales)):
-            found |= keys(inner[0], f"{prefix}{name}.")
-        else:
-            found.add(prefix + name)
-    return found
-
-
 def stated(content: dict, known: set[str], prefix: str = "") -> set[str]:
     """Keys of `known` that stand in `content`."""
     found = set()
@@ -375,75 +357,6 @@ def test_units(quantity, unit, factor):
 
 # --- round trip ----------------------------------------------------------------------------------
 
-positive = st.floats(1e-6, 1e6)
-hyperparameters = st.one_of(
-    positive,
-    st.fixed_dictionaries(
-        {"median": positive}, optional={"log_sd": st.floats(0.01, 5), "fixed": st.booleans()}
-    ),
-)
-components = st.lists(st.sampled_from(["time", "phase", "position", "velocity"]), unique=True)
-length_scales = st.fixed_dictionaries(
-    {}, optional=dict.fromkeys(("time", "phase", "position", "velocity"), hyperparameters)
-)
-templates = st.text(st.characters(codec="utf-8"), max_size=5).map(lambda text: text + "{axis}")
-
-
-@st.composite
-def impedance_priors(draw):
-    prior = draw(st.sampled_from(["log_gp", "gp"]))
-    content = {"prior": prior, "level": draw(hyperparameters), "input": draw(components)}
-    content["length_scale"] = draw(length_scales)
-    if prior == "gp":
-        content["sd"] = draw(hyperparameters)
-    elif draw(st.booleans()):
-        content["log_sd"] = draw(st.floats(0.01, 0.5))
-    return content
-
-
-@st.composite
-def configurations(draw):
-    """Plain content of a valid configuration."""
-    theta = draw(st.sampled_from(["time", "phase", "position", "position_velocity"]))
-    means = ["equilibrium", "reference", "constant"] + (["trial_average"] if theta == "phase" else [])
-    start = draw(st.none() | st.floats(-10, 10))
-    return {
-        "log": {
-            "axes": draw(st.none() | st.lists(st.sampled_from("xyz"), min_size=1, unique=True)),
-            "columns": {
-                "time": draw(st.text(st.characters(codec="utf-8"), max_size=8)),
-                "position": draw(templates),
-                "velocity": draw(st.none() | templates),
-            },
-            "units": {"time": draw(st.sampled_from(["s", "ms", "us", "ns"]))},
-            "window": {"start": start, "end": None if start is None else start + 1},
-            "delimiter": draw(st.none() | st.characters(codec="utf-8")),
-        },
-        "preprocessing": {
-            "smoother": draw(st.none() | st.fixed_dictionaries({"polynomial_order": st.integers(3, 7)})),
-            "rate": draw(st.none() | positive),
-        },
-        "model": {
-            "trajectory_input": theta,
-            "drop_acceleration": theta == "position_velocity" and draw(st.booleans()),
-            "desired_trajectory": {
-                "mean": draw(st.sampled_from(means)),
-                "sd": draw(hyperparameters),
-                "length_scale": draw(length_scales),
-                "value": draw(st.none() | st.dictionaries(st.sampled_from("xyz"), st.floats(-5, 5))),
-            },
-            "stiffness": draw(impedance_priors()),
-            "damping": draw(impedance_priors()),
-            "residual": draw(
-                st.none() | st.fixed_dictionaries({"sd": hyperparameters, "input": components.filter(bool)})
-            ),
-            "noise_sd": draw(hyperparameters),
-        },
-        "engine": {"jitter": draw(st.floats(0, 1e-3))},
-        "training": {"seed": draw(st.integers(0, 2**70)), "restarts": draw(st.integers(1, 100))},
-        "baseline": {"input": draw(st.none() | components.filter(bool))},
-    }
-
 
 @settings(max_examples=60, deadline=None)
 @given(configurations())
@@ -455,42 +368,6 @@ def test_dump_and_parse_give_the_same_configuration(content):
 
 
 # --- never anything but ConfigurationError -------------------------------------------------------
-
-names = st.one_of(
-    st.sampled_from(sorted({part for key in keys(Config) for part in key.split(".")} | {"median", "log_sd"})),
-    st.text(max_size=5),
-)
-scalars = st.one_of(
-    st.none(),
-    st.booleans(),
-    st.integers(),
-    st.floats(),
-    st.text(max_size=8),
-    st.binary(max_size=4),
-    st.dates(),
-    st.sampled_from(["time", "phase", "gp", "x", "trial_average", "{axis}", "1e-3"]),
-)
-yamlish = st.recursive(
-    scalars,
-    lambda inner: st.one_of(
-        st.lists(inner, max_size=3),
-        st.dictionaries(st.one_of(names, st.integers(), st.none()), inner, max_size=4),
-    ),
-    max_leaves=12,
-)
-
-
-def sections(section: type[Section] = Config) -> st.SearchStrategy:
-    """Content with known keys in their places and anything at all as values."""
-    inner = {}
-    for name, entry in section.model_fields.items():
-        kinds = [
-            kind
-            for kind in (entry.annotation, *getattr(entry.annotation, "__args__", ()))
-            if isinstance(kind, type) and issubclass(kind, Section)
-        ]
-        inner[name] = st.one_of(yamlish, sections(kinds[0])) if kinds else yamlish
-    return st.fixed_dictionaries({}, optional=inner)
 
 
 def problem(read: Callable[[], Config]) -> str | None:

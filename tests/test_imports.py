@@ -15,7 +15,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
         frozenset,
         (
             {"errors"},
-            {"config", "outputs"},
+            {"config", "outputs", "journal"},
             {"log", "metrics"},
             {"readers", "readers.table", "preprocessing"},
             {"trajectory_mean", "device"},
@@ -78,6 +78,7 @@ CONFINED = {
     "yaml": {"config"},
     "safetensors": {"persistence"},
     "pyarrow": {"readers.table"},
+    "filelock": {"journal"},
 }
 
 

@@ -5,10 +5,12 @@ import os
 import shutil
 import stat
 import tempfile
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 
+from bayes_impedance import outputs
 from bayes_impedance.errors import OutputError
 from bayes_impedance.outputs import check_replaceable, check_writable, whole_file, whole_folder
 
@@ -237,7 +239,8 @@ def test_nothing_is_left_of_half_a_folder(tmp_path, old, failure):
 def test_old_folder_survives_a_failure_while_the_new_one_is_put_in_place(
     tmp_path, old, monkeypatch, call, failure
 ):
-    """First the old folder steps aside, then the new one takes its place: either may fail."""
+    """Where names cannot be swapped the old folder first steps aside, then the new one comes: either may fail."""
+    monkeypatch.setattr(outputs, "_exchange", lambda *_: False)
     calls = 0
     rename = Path.rename
 
@@ -254,6 +257,36 @@ def test_old_folder_survives_a_failure_while_the_new_one_is_put_in_place(
     with pytest.raises(expected), whole_folder(old, MARKER) as place:
         (place / MARKER).write_text("new")
     assert content(tmp_path) == before
+
+
+@pytest.mark.parametrize("swap", [True, False])
+def test_one_folder_stands_there_when_two_are_put_in_place_at_once(tmp_path, monkeypatch, swap):
+    if not swap:
+        monkeypatch.setattr(outputs, "_exchange", lambda *_: False)
+    path = tmp_path / "model"
+    with whole_folder(path, MARKER) as one, whole_folder(path, MARKER) as other:
+        (one / MARKER).write_text("one")
+        (other / MARKER).write_text("other")
+    assert content(tmp_path) == {f"model/{MARKER}": "one"}
+
+
+@pytest.mark.parametrize("kind", [MARKER, "thesis.tex"])
+def test_folder_that_appears_at_the_last_moment_is_replaced_if_it_is_of_the_same_kind(
+    tmp_path, monkeypatch, kind
+):
+    path = tmp_path / "model"
+    rename = Path.rename
+
+    def late(self: Path, target: Path) -> Path:
+        path.mkdir()
+        (path / kind).write_text("another process")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", late)
+    refused = pytest.raises(OutputError, match="could not be written: Directory not empty")
+    with nullcontext() if kind == MARKER else refused, whole_folder(path, MARKER) as place:
+        (place / MARKER).write_text("mine")
+    assert content(tmp_path) == {f"model/{kind}": "mine" if kind == MARKER else "another process"}
 
 
 def test_old_folder_that_cannot_be_removed_does_not_spoil_the_new_one(tmp_path, old, monkeypatch):
