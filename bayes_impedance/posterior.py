@@ -25,6 +25,7 @@ from bayes_impedance.engines.closed_loop import LoopEvidence
 from bayes_impedance.engines.dense import Factor
 from bayes_impedance.features import Features
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, TRAJECTORY_ORDER, InteractionKernel, Latent
+from bayes_impedance.kernels.warped import ImpedanceProcess
 from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.priors import Entry, ForceModel
 from bayes_impedance.training import observations
@@ -224,7 +225,8 @@ class _Conditioner:
         # On padding α is zero.
         location = prior.location + (cross.mT @ self.factor.alpha.unsqueeze(-1)).squeeze(-1)
         # Rounding can push the variance of a fully determined variable just below zero.
-        variance = (prior.own_variance - white.square().sum(-2)).clamp_min(0.0)
+        known = (prior.own_variance - white.square().sum(-2)).clamp_min(0.0)
+        variance = known
         if self.has_levels:
             loading = prior.loading - white.mT @ self.white_loading
             variance = variance + ((loading @ self.level_covariance) * loading).sum(-1)
@@ -233,9 +235,29 @@ class _Conditioner:
             location = location + with_loop * self.loop.jacobian.slope.unsqueeze(-1)
             with_loop = with_loop + (loading @ self.loop_loading).squeeze(-1)
             variance = (variance - with_loop.square() * self.loop_gain).clamp_min(0.0)
+        if _is_warped(self.model, latent):
+            location = _unwarped(location, prior.location, known, prior.own_variance)
         if latent is Latent.FORCE:
             variance = variance + self.model.noise_variance
         return location, variance, prior.shown.expand_as(location), prior.variance.expand_as(location)
+
+
+def _unwarped(location: Tensor, prior_location: Tensor, variance: Tensor, prior_variance: Tensor) -> Tensor:
+    """Location of log w to second order: that of the log-normal whose moments are those of w given the forces.
+
+    To first order E[w|u] = E[w] (1 + a) with the shift a of log w, and E[w] = exp(location + ½ prior variance). The
+    logarithm of 1 + a is replaced by its expansion below zero, where a linear estimate of w may become negative.
+    """
+    a = location - prior_location
+    log = torch.where(a > 0.0, torch.log1p(a.clamp_min(0.0)), a - 0.5 * a.square())
+    return prior_location + 0.5 * (prior_variance - variance) + log
+
+
+def _is_warped(model: ForceModel, latent: Latent) -> bool:
+    if latent not in IMPEDANCE_ORDER or not isinstance(model.kernel, InteractionKernel):
+        return False
+    process: ImpedanceProcess = model.kernel.impedance.processes[IMPEDANCE_ORDER[latent]]
+    return process.law == "log_gaussian"
 
 
 def _prior_only(model: ForceModel, target: Features, latents: Sequence[Latent]) -> dict[Latent, Moments]:
@@ -343,10 +365,7 @@ def _marginal(
             rows = target.rows[target.groups.index(group)]
             arrays[:, starts[rows[:, 0]] + rows[:, 1]] = np.moveaxis(stacked[:, :, g, : len(rows)], 1, 2)
     location, variance, prior_location, prior_variance = arrays
-    warped = (
-        latent in IMPEDANCE_ORDER
-        and model.kernel.impedance.processes[IMPEDANCE_ORDER[latent]].law == "log_gaussian"
-    )
+    warped = _is_warped(model, latent)
     return Marginal(latent, warped, location, np.sqrt(variance), prior_location, np.sqrt(prior_variance))
 
 

@@ -20,6 +20,7 @@ from oracles import (
     some_rows,
     truth_of,
 )
+from torch import Tensor
 
 from bayes_impedance import training
 from bayes_impedance.config import Config
@@ -122,6 +123,16 @@ def level_variances(config: Config) -> list[float]:
     return variances
 
 
+def second_order(mean: Tensor, variance: Tensor, prior_mean: Tensor, prior_variance: Tensor) -> Tensor:
+    """E[log w] of the log-normal whose mean is E[w] (1 + a) and whose log-variance is that of the linear estimate."""
+    locations = []
+    for linear, known, before, own in zip(mean, variance, prior_mean, prior_variance, strict=True):
+        a = float(linear - before)
+        log = np.log1p(a) if a > 0 else a - 0.5 * a**2
+        locations.append(float(before + 0.5 * own) + log - 0.5 * float(known))
+    return torch.tensor(locations, dtype=torch.float64)
+
+
 @pytest.mark.parametrize("name", DESIGNS)
 def test_posterior_equals_naive_conditioning(name: str) -> None:
     config = configuration(**DESIGNS[name])
@@ -142,7 +153,10 @@ def test_posterior_equals_naive_conditioning(name: str) -> None:
             given = samples[torch.from_numpy(given_rows)]
             noise = config.model.noise_sd.median**2
             # The mean is the one at the fitted level; the variance is that of b drawn with everything else.
-            mean, _ = condition(oracle, given, force, samples, latent, noise, jitter=1e-10)
+            mean, known = condition(oracle, given, force, samples, latent, noise, jitter=1e-10)
+            if posterior[latent].warped:
+                own_prior = oracle.own(samples, latent).diagonal()
+                mean = second_order(mean, known, oracle.location(samples, latent), own_prior)
             _, variance = condition(
                 oracle, given, force, samples, latent, noise, level_variances(config), jitter=1e-10
             )
@@ -173,6 +187,24 @@ def test_prior_moments_with_learned_levels() -> None:
         # Nothing was given.
         np.testing.assert_allclose(marginal.location, marginal.prior_location, rtol=1e-14)
         np.testing.assert_array_equal(marginal.scale, marginal.prior_scale)
+
+
+@pytest.mark.parametrize("true", [120.0, 150.0, 157.0, 200.0, 250.0])
+def test_stiffness_that_the_data_know_is_the_true_one_wherever_its_median_stands(true: float) -> None:
+    """To first order in log k it would be low by half the prior variance, .045, where E[k] = 157 N/m is the truth."""
+    known: dict[str, object] = {
+        "trajectory_input": "time",
+        "desired_trajectory": {**MODEL["desired_trajectory"], "sd": 1e-5},
+        "damping": {"level": 9, "log_sd": 1e-3},
+        "mass": {"level": 1.2, "sd": 1e-3},
+        "residual": None,
+        "noise_sd": 0.05,
+    }
+    truth = configuration(**known, stiffness={"level": true, "log_sd": 1e-4})
+    log = draw_force(truth, repeated_motion(2, duration=2.0, rate=20.0, displacement_sd=0.03), seed=2)
+    model = ImpedanceModel(configuration(**known, stiffness={"level": 150, "log_sd": 0.3}))
+    stiffness = model.posterior(log)["stiffness"]
+    np.testing.assert_allclose(stiffness.location, np.log(true), atol=0.025)
 
 
 @pytest.mark.parametrize("name", ["equilibrium", "levels_learned_equilibrium"])

@@ -34,8 +34,8 @@ def fixed_levels(device: bool = True, **model: object) -> Config:
     """Levels without uncertainty, so that the mass is the only thing that the quadrature has to run over."""
     content = configuration(
         desired_trajectory={"mean": "reference", "sd": 0.01},
-        stiffness={"level": 150, "log_sd": 0.3, "input": ["position"]},
-        damping={"level": 12, "log_sd": 0.2},
+        stiffness={"prior": "gp", "level": 150, "sd": 45, "input": ["position"]},
+        damping={"prior": "gp", "level": 12, "sd": 2.4},
         mass={"level": 1.2, "sd": 0.3},
         residual={"sd": 0.4, "input": ["position", "velocity"]},
         noise_sd=0.2,
@@ -62,9 +62,10 @@ class Quadrature:
         self.kernel, self.x = model.kernel, features.inputs[0, 0]
         impedance = self.kernel.impedance
         mass, mass_sd = float(impedance.mass.level[0]), float(impedance.mass.covariance.sd[0])
-        median, log_sd = float(impedance.damping.level[0]), float(impedance.damping.covariance.sd[0])
-        damping = median * np.exp(0.5 * log_sd**2)
-        damping_variance = damping**2 * np.expm1(log_sd**2)
+        damping, damping_variance = (
+            float(impedance.damping.level[0]),
+            float(impedance.damping.covariance.sd[0]) ** 2,
+        )
         share = 1.0 - 0.5 * step * DEVICE_DAMPING / DEVICE_MASS
         # z = share · m + ½ Δ d
         self.mean = share * mass + 0.5 * step * damping
@@ -74,11 +75,11 @@ class Quadrature:
         n = len(self.x)
         constant = torch.ones(n, dtype=torch.float64)
         errors = [self.x[:, column] for column in impedance.layout.error]
-        #: Covariance of z with each latent, or its logarithm.
+        #: Covariance of z with each latent.
         self.with_z = {
             Latent.FORCE: errors[2] * share * mass_sd**2 + 0.5 * step * errors[1] * damping_variance,
             Latent.MASS: constant * share * mass_sd**2,
-            Latent.DAMPING: constant * 0.5 * step * damping * log_sd**2,
+            Latent.DAMPING: constant * 0.5 * step * damping_variance,
         }
         column = self.with_z[Latent.FORCE]
         noise = model.noise_variance[0, 0] * torch.eye(n, dtype=torch.float64)
@@ -262,7 +263,7 @@ def test_gradient_of_the_objective_is_that_of_finite_differences() -> None:
 
 def test_apparent_mass_of_damping_along_the_path_is_a_double_sum() -> None:
     content = fixed_levels().model_dump(mode="json")
-    content["model"]["damping"] |= {"input": ["position"], "log_sd": {"median": 0.4, "fixed": True}}
+    content["model"]["damping"] |= {"prior": "log_gp", "sd": None, "log_sd": 0.4, "input": ["position"]}
     log, features, model = problem(parse_config(content))
     impedance, given = model.kernel.impedance, observations(model, features)
     with torch.no_grad():
