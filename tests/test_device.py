@@ -126,7 +126,10 @@ def test_law_needs_force(prepared: PreparedLog) -> None:
 
 def test_an_axis_without_mass_is_named(prepared: PreparedLog) -> None:
     for device, words in (
-        ({"mass": {"y": 2.0}}, r"device\.mass: expected a mass \[kg\] for each of x, found none for x"),
+        (
+            {"mass": {"y": 2.0}},
+            r"device\.mass: expected a mass \[kg\] for each of x, found none for x; add it, or give one number for all",
+        ),
         ({"mass": 2.0, "damping": {"y": 1.0}}, r"device\.damping: expected a damping \[Ns/m\] for each of x"),
     ):
         with pytest.raises(ConfigurationError, match=words):

@@ -338,7 +338,7 @@ def test_stopped_by_hand_it_continues(tiny, config, path):
 
     expected = state(ImpedanceModel(config).fit(tiny.fitted.fitted.log))
     with open_journal(path) as journal:
-        half = ImpedanceModel(config).fit(tiny.fitted.fitted.log, stop, journal)
+        half = ImpedanceModel(config).fit(tiny.fitted.fitted.log, stop, journal=journal)
     assert half.report.interrupted
     assert state(fit(tiny, config, path)) == expected
 

@@ -34,5 +34,11 @@ def test_wheel_outside_the_checkout(tmp_path: Path) -> None:
     )
     assert result.returncode == 0, result.stderr
     assert result.stdout.split() == [
-        "phase", "position", "position_velocity", "recordings/iiwa_known_equilibrium", "time",
-    ]  # fmt: skip
+        "admittance",
+        "phase",
+        "position",
+        "position_velocity",
+        "recordings/delta_robot",
+        "recordings/iiwa_known_equilibrium",
+        "time",
+    ]
