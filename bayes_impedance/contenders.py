@@ -9,7 +9,7 @@ from typing import Literal, get_args
 
 from bayes_impedance.baselines.naive import NaiveModel
 from bayes_impedance.baselines.without_residual import without_residual
-from bayes_impedance.config import Config, TrainingConfig
+from bayes_impedance.config import Config, DeviceConfig, TrainingConfig
 from bayes_impedance.errors import ConfigurationError
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.model import ImpedanceModel
@@ -83,6 +83,8 @@ def baseline_contenders(config: Config, baselines: Sequence[Baseline]) -> list[C
 def check_comparable(config: Config, against: Mapping[str, ImpedanceModel]) -> None:
     """Refuse other models that are not of the same samples as `config`: sections `log` and `preprocessing` are equal.
 
+    So is `device`, where a model takes the acceleration from its law.
+
     Raises:
         ConfigurationError: they differ, or a name is taken.
     """
@@ -100,6 +102,17 @@ def check_comparable(config: Config, against: Mapping[str, ImpedanceModel]) -> N
                         f"{name}: expected the same {section}.{key} as the model that it is compared with "
                         f"({_shown(value)}), so that both see the same samples, got {_shown(its[key])}; set it alike"
                     )
+        if _law(config) != _law(model.config):
+            raise ConfigurationError(
+                f"{name}: expected the same device as the model that it is compared with, for one of them takes the "
+                "acceleration from its law, so that both see the same samples; set it alike, or device.acceleration: "
+                "measured in both"
+            )
+
+
+def _law(config: Config) -> DeviceConfig | None:
+    """The device whose law gives the acceleration."""
+    return config.device if config.device is not None and config.device.acceleration == "law" else None
 
 
 def _shown(value: object) -> str:

@@ -244,6 +244,11 @@ def test_a_competitor_with_other_training_is_questioned(tiny, other, bare):
             r"^other: expected the same log\.axes .* \(null\), .*, got \['x'\]; set it alike$",
         ),
         (
+            "other",
+            ["device={mass: 2, damping: 6, acceleration: law}"],
+            r"^other: expected the same device as the model .* set it alike, or device\.acceleration: measured in both",
+        ),
+        (
             "naive",
             [],
             "^against: expected names other than impedance, naive, .*, got 'naive'; rename that model",
