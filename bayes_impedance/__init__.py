@@ -26,10 +26,10 @@ The formulas are in docs/model.md, whose section numbers the docstrings quote. E
 
 from bayes_impedance.config import Config as Config
 from bayes_impedance.config import load_config as load_config
-from bayes_impedance.cross_validation import cross_validate as cross_validate
 from bayes_impedance.errors import BayesImpedanceError as BayesImpedanceError
-from bayes_impedance.evaluation import evaluate as evaluate
-from bayes_impedance.explained import impedance_share as impedance_share
+from bayes_impedance.evaluation.cross_validation import cross_validate as cross_validate
+from bayes_impedance.evaluation.explained import impedance_share as impedance_share
+from bayes_impedance.evaluation.held_out import evaluate as evaluate
 from bayes_impedance.identifiability import Support as Support
 from bayes_impedance.identifiability import Verdict as Verdict
 from bayes_impedance.kernels.impedance import Latent as Latent

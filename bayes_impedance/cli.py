@@ -18,9 +18,6 @@ from rich.markup import escape
 
 from bayes_impedance import terminal
 from bayes_impedance.config import load_config, shipped_configurations
-from bayes_impedance.contenders import Baseline
-from bayes_impedance.cross_validation import as_json as folds_as_json
-from bayes_impedance.cross_validation import cross_validate
 from bayes_impedance.demo import record, truth_errors
 from bayes_impedance.errors import (
     BayesImpedanceError,
@@ -29,7 +26,10 @@ from bayes_impedance.errors import (
     LogError,
     OutputError,
 )
-from bayes_impedance.evaluation import as_json, evaluate
+from bayes_impedance.evaluation.contenders import Baseline
+from bayes_impedance.evaluation.cross_validation import as_json as folds_as_json
+from bayes_impedance.evaluation.cross_validation import cross_validate
+from bayes_impedance.evaluation.held_out import as_json, evaluate
 from bayes_impedance.identifiability import summarise
 from bayes_impedance.journal import open_journal
 from bayes_impedance.kernels.impedance import Latent

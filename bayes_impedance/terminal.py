@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from bayes_impedance.config import TrainingConfig
-from bayes_impedance.evaluation import Evaluation
+from bayes_impedance.evaluation.held_out import Evaluation
 from bayes_impedance.identifiability import Support, Verdict, caveat, rounded
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.posterior import Posterior

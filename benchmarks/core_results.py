@@ -18,7 +18,7 @@ import numpy as np
 from bayes_impedance import ImpedanceModel, InteractionLog, Latent, evaluate, load_config, read_log
 from bayes_impedance.config import Config, parse_config
 from bayes_impedance.demo import record, truth_errors
-from bayes_impedance.evaluation import as_json
+from bayes_impedance.evaluation.held_out import as_json
 from bayes_impedance.features import FeatureMap, Features
 from bayes_impedance.posterior import compute_posterior
 from bayes_impedance.priors import build_force_model

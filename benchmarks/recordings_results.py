@@ -10,7 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from bayes_impedance import ImpedanceModel, cross_validate, load_config, prior_sensitivity, read_log
-from bayes_impedance.cross_validation import as_json
+from bayes_impedance.evaluation.cross_validation import as_json
 from benchmarks.results import RECORDINGS, Results, commit
 
 FILES = {

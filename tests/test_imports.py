@@ -16,7 +16,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
         (
             {"errors"},
             {"config", "outputs", "journal"},
-            {"log", "metrics"},
+            {"log", "evaluation.metrics"},
             {"readers", "readers.table", "preprocessing"},
             {"trajectory_mean", "device"},
             {"kernels", "kernels.stationary", "kernels.derivative", "kernels.warped", "kernels.impedance"},
@@ -27,16 +27,16 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             {"posterior"},
             {
                 "identifiability",
-                "explained",
-                "folds",
+                "evaluation.explained",
+                "evaluation.folds",
                 "baselines",
                 "baselines.naive",
                 "baselines.without_residual",
             },
             {"model"},
-            {"persistence", "contenders", "sensitivity"},
-            {"evaluation"},
-            {"cross_validation"},
+            {"persistence", "evaluation.contenders", "sensitivity"},
+            {"evaluation.held_out"},
+            {"evaluation", "evaluation.cross_validation"},
             {"__init__"},
             {"simulation", "simulation.generative", "simulation.device", "plotting", "terminal"},
             {"demo"},
@@ -67,7 +67,7 @@ PRESENTATION = {
 }
 
 #: What a kernel may know of this package: other kernels. They are to be taken into other people's code.
-FREE = ("kernels.", "metrics", "errors")
+FREE = ("kernels.", "evaluation.metrics", "errors")
 
 #: Libraries that only some layers may load, for they are slow or have no place elsewhere.
 CONFINED = {
@@ -145,7 +145,9 @@ def test_nothing_but_the_command_line_shows_draws_or_simulates(module):
     assert not imported(module)[0] & PRESENTATION
 
 
-@pytest.mark.parametrize("module", ["errors", "metrics", *(m for m in MODULES if m.startswith("kernels"))])
+@pytest.mark.parametrize(
+    "module", ["errors", "evaluation.metrics", *(m for m in MODULES if m.startswith("kernels"))]
+)
 def test_foundations_stand_alone(module):
     assert all(other.startswith(FREE) for other in imported(module)[0])
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from bayes_impedance.config import load_config, parse_config
-from bayes_impedance.cross_validation import cross_validate
 from bayes_impedance.errors import LogWarning
-from bayes_impedance.folds import split
+from bayes_impedance.evaluation.cross_validation import cross_validate
+from bayes_impedance.evaluation.folds import split
 from bayes_impedance.identifiability import Support, caveat
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.log import InteractionLog

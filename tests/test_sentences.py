@@ -50,7 +50,7 @@ REFUSALS = tuple(refusals())
 
 def quoted() -> str:
     """All strings of the tests, with what a regular expression escapes as it is meant."""
-    tests = sorted(set(Path(__file__).parent.glob("test_*.py")) - {Path(__file__)})
+    tests = sorted(set(Path(__file__).parent.rglob("test_*.py")) - {Path(__file__)})
     lines = (text for path in tests for text in strings(ast.parse(path.read_text(encoding="utf-8"))))
     return "\n".join(re.sub(r"\\(\W)", r"\1", line) for line in lines)
 

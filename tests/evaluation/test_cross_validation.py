@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bayes_impedance import contenders, cross_validation
 from bayes_impedance.baselines.naive import NaiveModel
 from bayes_impedance.baselines.without_residual import without_residual
 from bayes_impedance.config import parse_config
-from bayes_impedance.cross_validation import as_json, cross_validate
 from bayes_impedance.demo import TRUTH
 from bayes_impedance.errors import ConfigurationError, LogError, LogWarning, TooManySamplesError
-from bayes_impedance.evaluation import evaluate
+from bayes_impedance.evaluation import contenders, cross_validation
+from bayes_impedance.evaluation.cross_validation import as_json, cross_validate
+from bayes_impedance.evaluation.held_out import evaluate
+from bayes_impedance.evaluation.metrics import score
 from bayes_impedance.features import FeatureMap
 from bayes_impedance.log import InteractionLog
-from bayes_impedance.metrics import score
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.readers import read_log

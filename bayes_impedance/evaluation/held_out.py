@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayes_impedance.baselines.naive import NaiveModel
-from bayes_impedance.contenders import (
+from bayes_impedance.errors import LogError, LogWarning
+from bayes_impedance.evaluation.contenders import (
     IMPEDANCE,
     Baseline,
     Contender,
@@ -20,12 +21,11 @@ from bayes_impedance.contenders import (
     check_comparable,
     predict_force,
 )
-from bayes_impedance.errors import LogError, LogWarning
-from bayes_impedance.explained import EXPLAINING, impedance_share
+from bayes_impedance.evaluation.explained import EXPLAINING, impedance_share
+from bayes_impedance.evaluation.metrics import Prediction, Scores, score, varies
 from bayes_impedance.features import trial_key
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.log import InteractionLog
-from bayes_impedance.metrics import Prediction, Scores, score, varies
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.preprocessing import PreparedLog
 

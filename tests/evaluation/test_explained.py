@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bayes_impedance.config import parse_config
-from bayes_impedance.explained import EXPLAINING, impedance_share
+from bayes_impedance.evaluation.explained import EXPLAINING, impedance_share
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.posterior import Marginal, Posterior
 from bayes_impedance.preprocessing import PreparedLog

@@ -14,8 +14,8 @@ from scipy.stats import norm
 from bayes_impedance.baselines.naive import NaiveModel, naive_config
 from bayes_impedance.config import Config, load_config, parse_config
 from bayes_impedance.errors import ConfigurationError, LogError, LogWarning
-from bayes_impedance.evaluation import as_json, evaluate
-from bayes_impedance.explained import EXPLAINING, impedance_share
+from bayes_impedance.evaluation.explained import EXPLAINING, impedance_share
+from bayes_impedance.evaluation.held_out import as_json, evaluate
 from bayes_impedance.log import InteractionLog
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.preprocessing import PreparedLog

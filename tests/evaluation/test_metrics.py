@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from bayes_impedance.metrics import Prediction, pooled_score, score, varies
+from bayes_impedance.evaluation.metrics import Prediction, pooled_score, score, varies
 
 
 def predictions(n: int = 200, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayes_impedance.contenders import (
+from bayes_impedance.evaluation.contenders import (
     IMPEDANCE,
     Baseline,
     Contender,
@@ -16,10 +16,10 @@ from bayes_impedance.contenders import (
     baseline_contenders,
     check_comparable,
 )
-from bayes_impedance.evaluation import Evaluation, check_variation, predict, shares
-from bayes_impedance.folds import Folds, split
+from bayes_impedance.evaluation.folds import Folds, split
+from bayes_impedance.evaluation.held_out import Evaluation, check_variation, predict, shares
+from bayes_impedance.evaluation.metrics import Prediction, Scores, pooled_score
 from bayes_impedance.log import InteractionLog
-from bayes_impedance.metrics import Prediction, Scores, pooled_score
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.preprocessing import PreparedLog
 

@@ -7,8 +7,8 @@ import pytest
 
 from bayes_impedance.config import load_config, parse_config
 from bayes_impedance.errors import ConfigurationError, LogError, LogWarning, TooManySamplesError
+from bayes_impedance.evaluation.folds import split
 from bayes_impedance.features import FeatureMap
-from bayes_impedance.folds import split
 from bayes_impedance.log import InteractionLog
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.preprocessing import PreparedLog, prepare
