@@ -6,6 +6,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -81,23 +82,42 @@ def test_make_targets_and_links_exist() -> None:
         assert (ROOT / link).is_file(), link
 
 
+def figures_of(name: str) -> dict[str, Any]:
+    return json.loads((ROOT / "results" / f"{name}.json").read_text(encoding="utf-8"))["figures"]
+
+
 def test_quoted_figures_are_those_of_the_results() -> None:
-    figures = json.loads((ROOT / "results" / "core.json").read_text(encoding="utf-8"))["figures"]
+    core, loop, recordings = (figures_of(name) for name in ("core", "closed_loop", "recordings"))
     table = README.split("<!-- figures:")[1].split("<!-- end of figures -->")[0]
-    iiwa, scores = figures["known_equilibrium"], figures["demo"]["scores"]["axes"]
+    iiwa, scores = core["known_equilibrium"], core["demo"]["scores"]["axes"]
     stiffness, late = iiwa["stiffness"], iiwa["reference_one_second_late"]
+    known = recordings["iiwa_known_equilibrium"]["last_third"]["axes"]["z"]
+    pushed = recordings["delta_robot"]["last_third"]["axes"]
+    models = ("impedance", "naive", "impedance_without_residual")
+    coverages = [rows[model]["coverage90"] for rows in pushed.values() for model in models]
     quoted = [
         f"{stiffness['mean']:.1f} N/m, 90 % interval {stiffness['q05']:.1f}–{stiffness['q95']:.1f}",
         f"{iiwa['least_squares_stiffness']:.1f} N/m, least-squares",
         f"{late['log_likelihood']:.1f}, {late['residual_rms']:.2f} N rms",
         f"{iiwa['log_likelihood']:.1f}, {iiwa['residual_rms']:.2f} N rms",
+        *(f"{known[model]['msll']:.2f}" for model in models),
+        *(", ".join(f"{pushed[axis][model]['msll']:.2f}" for axis in "xyz") for model in models),
+        f"{min(coverages):.0%} to {max(coverages):.0%}",
         ", ".join(f"{scores[axis]['impedance']['msll']:.2f}" for axis in "xy"),
         ", ".join(f"{scores[axis]['naive']['msll']:.2f}" for axis in "xy"),
         *(
-            ", ".join(f"{figures['coverage'][theta][latent]:.0%}" for theta in ("time", "phase", "position"))
+            ", ".join(f"{loop[way][size][name]['mean']:{form}}" for size in ("1 N", "2 N", "5 N"))
+            for way in ("jacobian", "without_jacobian")
+            for name, form in (("mass", ".2f"), ("stiffness", ".0f"))
+        ),
+        *(
+            ", ".join(f"{core['coverage'][theta][latent]:.0%}" for theta in ("time", "phase", "position"))
             for latent in ("force", "desired_position")
         ),
     ]
     plain = table.replace("−", "-").replace(" %", "%")
     for figure in quoted:
         assert figure.replace(" %", "%") in plain, figure
+    faults = json.loads((ROOT / "results" / "faults.json").read_text(encoding="utf-8"))
+    generated = f"{faults['generated']:,}".replace(",", " ")
+    assert f"{generated} generated configurations" in " ".join(README.split())

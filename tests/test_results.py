@@ -2,37 +2,80 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from benchmarks.closed_loop_results import SEEDS, WAYS, estimate
 from benchmarks.core_results import configuration_of, coverage_of, demo, known_equilibrium
+from benchmarks.recordings_results import last_third
 
-COMMITTED = json.loads(
-    (Path(__file__).resolve().parent.parent / "results" / "core.json").read_text(encoding="utf-8")
-)
+RESULTS = Path(__file__).resolve().parent.parent / "results"
 
 
-def test_provenance_is_stated() -> None:
-    assert COMMITTED["command"] == "make results"
-    assert "bayes-impedance" in COMMITTED["versions"]
+def committed(name: str) -> dict[str, Any]:
+    return json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+
+
+CORE = committed("core")["figures"]
+
+
+@pytest.mark.parametrize("path", sorted(RESULTS.glob("*.json")), ids=lambda path: path.stem)
+def test_provenance_is_stated(path: Path) -> None:
+    record = committed(path.stem)
+    assert record["command"] in ("make results", "make faults")
+    assert "bayes-impedance" in record["versions"]
 
 
 def test_known_equilibrium(shared_data: Path) -> None:
-    committed, now = COMMITTED["figures"]["known_equilibrium"], known_equilibrium()
-    assert now["stiffness"]["mean"] == pytest.approx(committed["stiffness"]["mean"], rel=1e-3)
+    figures, now = CORE["known_equilibrium"], known_equilibrium()
+    assert now["stiffness"]["mean"] == pytest.approx(figures["stiffness"]["mean"], rel=1e-3)
     assert abs(now["relative_difference"]) < 0.05
     assert now["log_likelihood"] > now["reference_one_second_late"]["log_likelihood"] + 10
     assert now["residual_rms"] < now["reference_one_second_late"]["residual_rms"]
 
 
 def test_coverage() -> None:
-    committed = COMMITTED["figures"]["coverage"]["time"]
-    assert coverage_of(configuration_of("time"), range(committed["draws"]))["force"] == pytest.approx(
-        committed["force"], abs=2e-3
+    figures = CORE["coverage"]["time"]
+    assert coverage_of(configuration_of("time"), range(figures["draws"]))["force"] == pytest.approx(
+        figures["force"], abs=2e-3
     )
 
 
 def test_demo() -> None:
-    committed, now = COMMITTED["figures"]["demo"], demo()
-    for name, error in committed["mean_relative_error"].items():
+    figures, now = CORE["demo"], demo()
+    for name, error in figures["mean_relative_error"].items():
         assert now["mean_relative_error"][name] == pytest.approx(error, abs=0.01)
+
+
+def test_closed_loop() -> None:
+    """One seed lies as far from the mean as ten seeds scatter, and the figures are what the README says of them."""
+    figures = committed("closed_loop")["figures"]
+    assert figures["seeds"] == len(SEEDS)
+    assert set(WAYS) <= set(figures)
+    now = estimate("jacobian", 5.0, 0)
+    for name, entry in figures["jacobian"]["5 N"].items():
+        assert abs(now[name] - entry["mean"]) < 3.5 * entry["sd"] + 1e-9
+    at_two = figures["jacobian"]["2 N"]
+    assert abs(at_two["stiffness"]["bias"]) < 0.05
+    assert abs(at_two["mass"]["bias"]) < 0.10
+    masses = [figures["without_jacobian"][f"{p} N"]["mass"]["bias"] for p in (1, 2, 5)]
+    assert masses == sorted(masses)
+    assert masses[0] < -0.2
+
+
+def test_recordings(shared_data: Path) -> None:
+    figures, now = (
+        committed("recordings")["figures"]["iiwa_known_equilibrium"]["last_third"],
+        last_third("iiwa_known_equilibrium"),
+    )
+    assert now["samples"] == figures["samples"]
+    for name, scores in figures["axes"]["z"].items():
+        assert now["axes"]["z"][name]["nlpd"] == pytest.approx(scores["nlpd"], abs=0.02)
+    assert now["impedance_share"]["z"] == pytest.approx(figures["impedance_share"]["z"], abs=1e-3)
+
+
+def test_generated_inputs_left_no_traceback() -> None:
+    faults = committed("faults")
+    assert faults["generated"] == 5000
+    assert faults["tracebacks"] == 0
