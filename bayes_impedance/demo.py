@@ -67,7 +67,7 @@ def write_log(log: InteractionLog, path: Path) -> None:
         columns: dict[str, object] = {"trial": trial.name, "group": trial.group, "time": trial.time}
         if trial.phase is not None:
             columns |= {"repetition": trial.repetition, "phase": trial.phase}
-        vectors = {"position": trial.position, "force": trial.force, "reference": trial.reference}
+        vectors = {name: getattr(trial, name) for name in ("position", "force", "reference", "perturbation")}
         for name, values in vectors.items():
             if values is not None:
                 columns |= {f"{name}_{axis}": values[:, a] for a, axis in enumerate(log.axes)}

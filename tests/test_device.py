@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from bayes_impedance.config import DeviceConfig, PreprocessingConfig, parse_config
+from bayes_impedance.demo import write_log
 from bayes_impedance.device import Loop, follow_law
 from bayes_impedance.errors import ConfigurationError, LogError, LogWarning
 from bayes_impedance.log import InteractionLog
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.preprocessing import PreparedLog, prepare
+from bayes_impedance.readers import read_log
 from bayes_impedance.simulation.device import Admittance, Arm, held_device
+from conftest import Outcome
 
 ARM, DEVICE = Arm(), Admittance()
 LAW = DeviceConfig.model_validate({"mass": 2.0, "damping": 6.0, "acceleration": "law"})
@@ -24,6 +29,23 @@ MEASURED = LAW.model_copy(update={"acceleration": "measured"})
 @pytest.fixture(scope="module")
 def log() -> InteractionLog:
     return held_device(ARM, DEVICE, perturbation_sd=2.0, repetitions=3, seed=1)
+
+
+def test_written_log_trains_under_the_shipped_configuration(
+    log: InteractionLog, tmp_path: Path, command: Callable[..., Outcome]
+) -> None:
+    write_log(log, tmp_path / "log.csv")
+    np.testing.assert_array_equal(
+        read_log(tmp_path / "log.csv").trials[1].perturbation, log.trials[1].perturbation
+    )
+    quick = ("training.restarts=1", "training.max_iterations=2", "preprocessing.rate=10")
+    settings = [argument for item in quick for argument in ("--set", item)]
+    done = command(
+        "train", tmp_path / "log.csv", "--config", "admittance", "--out", tmp_path / "model", *settings
+    )
+    assert (done.code, done.err) == (0, "")
+    # The perturbation is recorded and the device is known, so nothing has to be taken on trust.
+    assert "presume" not in done.out
 
 
 @pytest.fixture(scope="module")
