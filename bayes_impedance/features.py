@@ -51,9 +51,7 @@ class FeatureMap:
         self.model = model
         self.axes = axes
         self.theta = theta_components(model)
-        self.xi = tuple(
-            dict.fromkeys((*model.stiffness.input, *model.damping.input, *_residual_input(model)))
-        )
+        self.xi = _xi_components(model)
         shared = config.shared.desired_trajectory
         self.trajectory_shared = model.trajectory_input != "time" if shared is None else shared
         self.residual_shared = config.shared.residual
@@ -190,11 +188,18 @@ def theta_components(model: ModelConfig) -> tuple[Component, ...]:
 
 def baseline_components(config: Config) -> tuple[Component, ...]:
     """Inputs of the naive GP: as configured, else all that the impedance model sees."""
-    if config.baseline.input is not None:
-        return config.baseline.input
-    model = config.model
-    every = (*theta_components(model), *model.stiffness.input, *model.damping.input, *_residual_input(model))
-    return tuple(dict.fromkeys(every))
+    return model_components(config.model) if config.baseline.input is None else config.baseline.input
+
+
+def model_components(model: ModelConfig) -> tuple[Component, ...]:
+    """Every input of the impedance model: θ and what stiffness, damping and residual depend on, each once."""
+    return tuple(dict.fromkeys((*theta_components(model), *_xi_components(model))))
+
+
+def _xi_components(model: ModelConfig) -> tuple[Component, ...]:
+    """Components of ξ, each once."""
+    residual = () if model.residual is None else model.residual.input
+    return tuple(dict.fromkeys((*model.stiffness.input, *model.damping.input, *residual)))
 
 
 def check_combination(config: Config, log: PreparedLog) -> None:
@@ -248,10 +253,6 @@ def _key(trial: PreparedTrial, force: Array | None) -> str:
     for array in (trial.time, trial.position, force):
         digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
-
-
-def _residual_input(model: ModelConfig) -> tuple[Component, ...]:
-    return () if model.residual is None else model.residual.input
 
 
 def _row_index(trial: int, samples: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -189,7 +189,8 @@ class _Conditioner:
 
     def __init__(self, model: ForceModel, given: Features, jitter: float) -> None:
         self.model, self.given = model, given
-        self.factor = Factor(model.kernel, observations(model, given), jitter)
+        forces = observations(model, given)
+        self.factor = Factor(model.kernel, forces, jitter)
         variance = _level_variance(model)
         self.has_levels = variance is not None
         if variance is not None:
@@ -202,9 +203,7 @@ class _Conditioner:
             self.level_covariance = root.unsqueeze(-1) * inner * root.unsqueeze(-2)
         self.loop = None
         if given.loop is not None:
-            self.loop = LoopEvidence(
-                model.kernel.impedance, self.factor, observations(model, given), given.loop
-            )
+            self.loop = LoopEvidence(model.kernel.impedance, self.factor, forces, given.loop)
             loading = self.loop.apparent.loading - self.loop.white.mT @ self.white_loading
             self.loop_loading = self.level_covariance @ loading.mT
             variance = self.loop.variance + (loading @ self.loop_loading).sum((-2, -1))

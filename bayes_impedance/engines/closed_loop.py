@@ -23,8 +23,7 @@ from bayes_impedance.engines.dense import (
     log_marginal_likelihood,
     quadratic_forms,
 )
-from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, ImpedanceKernel, Latent
-from bayes_impedance.kernels.warped import ImpedanceProcess
+from bayes_impedance.kernels.impedance import ImpedanceKernel, Latent
 
 #: The damping of z is averaged over so many samples, spread over those given.
 ANCHORS = 64
@@ -88,12 +87,12 @@ class ApparentMass:
     """
 
     def __init__(self, impedance: ImpedanceKernel, observations: Observations, loop: Loop) -> None:
-        self._impedance = impedance
+        self._layout, self._order = impedance.layout, impedance.order
+        _, self._damping, mass = impedance.processes
         self._half_step = 0.5 * loop.step
         self._mass_share = 1.0 - self._half_step * loop.device_damping / loop.device_mass
         self._anchors = _spread(observations)
-        mass, damping = self._mass, self._damping
-        half = self._half_step
+        half, damping = self._half_step, self._damping
         self.mean = self._mass_share * mass.level[..., 0, 0] + half * damping.expectation(self._anchors).mean(
             (-2, -1)
         )
@@ -111,27 +110,18 @@ class ApparentMass:
         half, damping = self._half_step.unsqueeze(-1), self._damping
         with_mass = self._with_mass.unsqueeze(-1)
         if latent is Latent.FORCE:
-            errors = self._impedance.layout.errors(x, self._impedance.order)
+            errors = self._layout.errors(x, self._order)
             if errors is None:
                 return x.new_zeros(x.shape[:-1])
             with_damping = half * damping.moments(x, self._anchors)[2].mean(-1)
-            by_order = {Latent.DAMPING: with_damping, Latent.MASS: with_mass}
-            parts = [errors[IMPEDANCE_ORDER[which]][..., 0] * part for which, part in by_order.items()]
-            return parts[0] + parts[1]
+            _, velocity_error, acceleration_error = errors
+            return velocity_error[..., 0] * with_damping + acceleration_error[..., 0] * with_mass
         if latent is Latent.DAMPING:
             expected = damping.sensitivity(self._anchors).mT
             return half * (expected * damping.gaussian_covariance(x, self._anchors)).mean(-1)
         if latent is Latent.MASS:
             return with_mass.expand(x.shape[:-1])
         return x.new_zeros(x.shape[:-1])
-
-    @property
-    def _mass(self) -> ImpedanceProcess:
-        return self._impedance.processes[IMPEDANCE_ORDER[Latent.MASS]]
-
-    @property
-    def _damping(self) -> ImpedanceProcess:
-        return self._impedance.processes[IMPEDANCE_ORDER[Latent.DAMPING]]
 
 
 class LoopEvidence:

@@ -17,8 +17,8 @@ from bayes_impedance.evaluation.contenders import (
     check_comparable,
 )
 from bayes_impedance.evaluation.folds import Folds, split
-from bayes_impedance.evaluation.held_out import Evaluation, check_variation, predict, shares
-from bayes_impedance.evaluation.metrics import Prediction, Scores, pooled_score
+from bayes_impedance.evaluation.held_out import Evaluation, check_variation, predict, scored, shares
+from bayes_impedance.evaluation.metrics import Scores
 from bayes_impedance.log import InteractionLog
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.preprocessing import PreparedLog
@@ -86,9 +86,9 @@ def cross_validate(
         predictors = {c.name: c.train(fold.training, progress, where) for c in contenders}
         predictions.append(predict(predictors, fold.training, fold.target, fold.test))
         explained.append(shares(predictors, prepared.axes))
-    each = (Evaluation(_scored([p]), share) for p, share in zip(predictions, explained, strict=True))
+    each = (Evaluation(scored([p]), share) for p, share in zip(predictions, explained, strict=True))
     return CrossValidation(
-        Evaluation(_scored(predictions), _mean(explained)),
+        Evaluation(scored(predictions), _mean(explained)),
         tuple(FoldEvaluation(fold.held_out, scores) for fold, scores in zip(splits, each, strict=True)),
     )
 
@@ -114,14 +114,6 @@ def _evaluation_as_json(evaluation: Evaluation) -> dict[str, object]:
 
 def _or_null(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-def _scored(folds: Sequence[Mapping[str, Mapping[str, Prediction]]]) -> dict[str, dict[str, Scores]]:
-    """Axis → model → scores over the samples of all folds."""
-    return {
-        axis: {name: pooled_score([fold[axis][name] for fold in folds]) for name in models}
-        for axis, models in folds[0].items()
-    }
 
 
 def _mean(folds: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:

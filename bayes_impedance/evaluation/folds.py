@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from bayes_impedance.config import Config
 from bayes_impedance.errors import ConfigurationError, LogError, LogWarning
-from bayes_impedance.features import theta_components, trial_key
+from bayes_impedance.features import model_components, trial_key
 from bayes_impedance.preprocessing import PreparedLog, PreparedTrial
 from bayes_impedance.trajectory_mean import phase_derivatives
 
@@ -130,10 +130,7 @@ def _with_force_at(trial: PreparedTrial, samples: npt.NDArray[np.bool_]) -> Prep
 
 def _question_phase(fold: Fold, config: Config) -> None:
     """Warn when the model is a function of phase and the last thirds lie at phases that no training sample has."""
-    model = config.model
-    residual = () if model.residual is None else model.residual.input
-    inputs = (*theta_components(model), *model.stiffness.input, *model.damping.input, *residual)
-    if "phase" not in inputs:
+    if "phase" not in model_components(config.model):
         return
     unseen = []
     for group in fold.training.groups:

@@ -22,7 +22,7 @@ from bayes_impedance.evaluation.contenders import (
     predict_force,
 )
 from bayes_impedance.evaluation.explained import EXPLAINING, impedance_share
-from bayes_impedance.evaluation.metrics import Prediction, Scores, score, varies
+from bayes_impedance.evaluation.metrics import Prediction, Scores, pooled_score, varies
 from bayes_impedance.features import trial_key
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.log import InteractionLog
@@ -90,13 +90,7 @@ def evaluate(
     rows = (IMPEDANCE, *(name for name in trained if name not in against), *against)
     predictors = {name: (fitted | trained)[name] for name in rows}
     predictions = predict(predictors, training, prepared, prepared)
-    return Evaluation(
-        {
-            axis: {name: score(p.mean, p.sd, p.force, p.training_force) for name, p in models.items()}
-            for axis, models in predictions.items()
-        },
-        shares(predictors, prepared.axes),
-    )
+    return Evaluation(scored([predictions]), shares(predictors, prepared.axes))
 
 
 def as_json(evaluation: Evaluation) -> dict[str, object]:
@@ -125,6 +119,16 @@ def predict(
             for name, marginal in marginals.items()
         }
         for a, axis in enumerate(test.axes)
+    }
+
+
+def scored(
+    folds: Sequence[Mapping[str, Mapping[str, Prediction]]],
+) -> dict[str, dict[str, Scores]]:
+    """Axis → model → scores over the samples of all folds."""
+    return {
+        axis: {name: pooled_score([fold[axis][name] for fold in folds]) for name in models}
+        for axis, models in folds[0].items()
     }
 
 
