@@ -1,4 +1,4 @@
-"""The command line: demo, train, infer, evaluate, show."""
+"""The command line: demo, simulate, train, infer, evaluate, show."""
 
 from __future__ import annotations
 
@@ -37,9 +37,10 @@ from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.outputs import check_replaceable, check_writable, prepare_folder, whole_file
 from bayes_impedance.persistence import METADATA, load_model, save_model
 from bayes_impedance.plotting import plot_force, save_figure, save_figures
-from bayes_impedance.posterior import Posterior
 from bayes_impedance.readers import read_log
 from bayes_impedance.sensitivity import Sensitivity, prior_sensitivity
+from bayes_impedance.simulation.command import simulate_command
+from bayes_impedance.writer import check_table_name, write_table
 
 BAD_INPUT, INTERRUPTED = 2, 130
 
@@ -159,12 +160,15 @@ def demo(
     watch = partial(terminal.training_progress, console)
     scores = evaluate(model, unseen, ["naive"], progress=watch)
     console.print(terminal.evaluation_table(scores))
-    _write_posterior(posterior, out / "posterior.csv")
+    write_table(posterior.table(), out / "posterior.csv")
     figures = [*save_figures(posterior, verdicts, out), out / "predicted_force.png"]
     predicted = model.posterior(unseen, given="training", latents=[Latent.FORCE])
     save_figure(plot_force(predicted, title="Force of an unseen repetition, predicted"), figures[-1])
     for path in (out / "model", out / "posterior.csv", *figures):
         console.print(f"wrote {path}")
+
+
+app.command(name="simulate")(simulate_command)
 
 
 @app.command()
@@ -247,14 +251,14 @@ def infer(
     Columns are <quantity>_<axis>_{mean,sd,q05,q95} in SI units. Without force in LOG nothing of it is conditioned on.
     """
     console = Console()
-    _posterior_format(out)
+    check_table_name(out)
     check_writable(out)
     trained = load_model(model)
     log = read_log(logs, trained.config.log, require_force=given is Given.log)
     posterior = trained.posterior(log, given.value)
     if figures is not None:
         prepare_folder(figures)
-    _write_posterior(posterior, out)
+    write_table(posterior.table(), out)
     verdicts = terminal.print_verdicts(console, trained, posterior)
     console.print(f"wrote {out}", highlight=False, soft_wrap=True)
     if figures is not None:
@@ -393,24 +397,6 @@ def _others(sources: Sequence[str]) -> dict[str, ImpedanceModel]:
 def _journal_of(model: Path) -> Path:
     target = model.resolve()
     return target.with_name(f"{target.name}.journal")
-
-
-def _posterior_format(path: Path) -> str:
-    if path.suffix not in (".csv", ".parquet"):
-        raise OutputError(
-            f"{path}: expected a file name ending in .csv or .parquet, got '{path.suffix}'; rename it"
-        )
-    return path.suffix
-
-
-def _write_posterior(posterior: Posterior, path: Path) -> None:
-    suffix = _posterior_format(path)
-    table = posterior.table()
-    with whole_file(path) as temporary:
-        if suffix == ".csv":
-            table.to_csv(temporary, index=False)
-        else:
-            table.to_parquet(temporary, index=False)
 
 
 def _refuse(message: str) -> NoReturn:

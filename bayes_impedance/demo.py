@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 
 from bayes_impedance.config import Config, load_config, parse_config
-from bayes_impedance.log import InteractionLog
-from bayes_impedance.outputs import whole_file
 from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.simulation.generative import as_recording, draw_force, repeated_motion
+from bayes_impedance.writer import write_log
 
 REPETITIONS = 5
 
@@ -54,27 +52,6 @@ def record(folder: Path, seed: int = 0) -> Recording:
     write_log(log.select([REPETITIONS - 1]), testing)
     # Half the usual rate: the displacements end at 2 Hz, and the demo should end within a minute.
     return Recording(training, testing, load_config("phase", ["preprocessing.rate=12.5"]))
-
-
-def write_log(log: InteractionLog, path: Path) -> None:
-    """Write a log as CSV with the default column names, truth included.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    frames = []
-    for trial in log.trials:
-        columns: dict[str, object] = {"trial": trial.name, "group": trial.group, "time": trial.time}
-        if trial.phase is not None:
-            columns |= {"repetition": trial.repetition, "phase": trial.phase}
-        vectors = {name: getattr(trial, name) for name in ("position", "force", "reference", "perturbation")}
-        for name, values in vectors.items():
-            if values is not None:
-                columns |= {f"{name}_{axis}": values[:, a] for a, axis in enumerate(log.axes)}
-        columns |= trial.truth
-        frames.append(pd.DataFrame(columns))
-    with whole_file(path) as temporary:
-        pd.concat(frames).to_csv(temporary, index=False)
 
 
 def truth_errors(posterior_of: Callable[[str], np.ndarray], log: PreparedLog) -> dict[str, float]:

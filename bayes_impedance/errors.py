@@ -29,6 +29,10 @@ class OutputError(BayesImpedanceError):
     """An output file or folder cannot be written."""
 
 
+class SimulationError(BayesImpedanceError):
+    """An arm, a device or a task is not physical, out of reach, or cannot be integrated at the step asked for."""
+
+
 class BayesImpedanceWarning(UserWarning):
     """Base of every warning that a user should read."""
 

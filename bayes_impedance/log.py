@@ -22,7 +22,7 @@ AXES = ("x", "y", "z")
 VECTORS = ("position", "force", "velocity", "acceleration", "reference", "perturbation")
 TRUTH_COLUMN = re.compile(
     r"(desired_position|desired_velocity|desired_acceleration|residual_force)_[xyz]"
-    r"|(stiffness|damping|mass)_[xyz]{2}"
+    r"|(stiffness|muscle_stiffness|damping|mass)_[xyz]{2}"
 )
 #: Nobody moves a handle this far [m]; more means that the unit is wrong.
 LARGEST_RANGE = 10.0

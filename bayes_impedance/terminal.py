@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from bayes_impedance.config import TrainingConfig
@@ -58,6 +58,15 @@ def sensitivity_progress(console: Console) -> Iterator[SensitivityHook]:
             bar.update(task, completed=done, total=planned, description=f"{done + 1}/{planned} {change}")
 
         yield hook
+
+
+@contextmanager
+def simulation_progress(console: Console, trials: int) -> Iterator[Callable[[int], None]]:
+    """A bar over trials; hidden where the output is no terminal."""
+    columns = (TextColumn("simulating"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
+        task = bar.add_task("", total=trials)
+        yield lambda done: bar.update(task, completed=done)
 
 
 def verdict_table(verdicts: Sequence[Verdict]) -> Table:

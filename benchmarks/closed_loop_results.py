@@ -14,7 +14,8 @@ from concurrent.futures import ProcessPoolExecutor
 import numpy as np
 
 from bayes_impedance import ImpedanceModel, load_config
-from bayes_impedance.simulation.device import Admittance, Arm, held_device
+from bayes_impedance.simulation.device import Admittance
+from bayes_impedance.simulation.one_axis import ConstantImpedance, held_device
 from benchmarks.results import Results, commit
 
 PERTURBATIONS = (1.0, 2.0, 5.0)  # [N]
@@ -24,12 +25,13 @@ WAYS = {
     "jacobian_measured_acceleration": ["device.acceleration=measured"],
     "without_jacobian": ["device=null"],
 }
-TRUTH = {"stiffness": Arm().stiffness, "damping": Arm().damping, "mass": Arm().mass}
+ARM = ConstantImpedance()
+TRUTH = {"stiffness": ARM.stiffness, "damping": ARM.damping, "mass": ARM.mass}
 
 
 def estimate(way: str, perturbation: float, seed: int) -> dict[str, float]:
     """Path averages of stiffness [N/m], damping [Ns/m] and mass [kg] from one simulated session."""
-    log = held_device(Arm(), Admittance(), perturbation, seed=seed)
+    log = held_device(ARM, Admittance(), perturbation, seed=seed)
     config = load_config("admittance", ["training.restarts=1", *WAYS[way]])
     model = ImpedanceModel(config).fit(log)
     posterior = model.posterior(model.fitted.log)

@@ -11,12 +11,13 @@ from pathlib import Path
 import pytest
 
 from bayes_impedance.config import Config, load_config, parse_config
-from bayes_impedance.demo import TRUTH, write_log
+from bayes_impedance.demo import TRUTH
 from bayes_impedance.errors import BayesImpedanceWarning
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.persistence import save_model
 from bayes_impedance.readers import read_log
 from bayes_impedance.simulation.generative import as_recording, draw_force, repeated_motion
+from bayes_impedance.writer import write_log
 
 #: `phase` with so little of everything that training takes a blink.
 TINY = (

@@ -11,17 +11,18 @@ import pytest
 from numpy.typing import NDArray
 
 from bayes_impedance.config import DeviceConfig, PreprocessingConfig, parse_config
-from bayes_impedance.demo import write_log
 from bayes_impedance.device import Loop, follow_law
 from bayes_impedance.errors import ConfigurationError, LogError, LogWarning
 from bayes_impedance.log import InteractionLog
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.preprocessing import PreparedLog, prepare
 from bayes_impedance.readers import read_log
-from bayes_impedance.simulation.device import Admittance, Arm, held_device
+from bayes_impedance.simulation.device import Admittance
+from bayes_impedance.simulation.one_axis import ConstantImpedance, held_device
+from bayes_impedance.writer import write_log
 from conftest import Outcome
 
-ARM, DEVICE = Arm(), Admittance()
+ARM, DEVICE = ConstantImpedance(), Admittance()
 LAW = DeviceConfig.model_validate({"mass": 2.0, "damping": 6.0, "acceleration": "law"})
 MEASURED = LAW.model_copy(update={"acceleration": "measured"})
 

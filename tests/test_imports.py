@@ -17,7 +17,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             {"errors"},
             {"config", "outputs", "journal"},
             {"log", "evaluation.metrics"},
-            {"readers", "readers.table", "preprocessing"},
+            {"readers", "readers.table", "preprocessing", "writer"},
             {"trajectory_mean", "device"},
             {"kernels", "kernels.stationary", "kernels.derivative", "kernels.warped", "kernels.impedance"},
             {"features"},
@@ -38,8 +38,20 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             {"evaluation.held_out"},
             {"evaluation", "evaluation.cross_validation"},
             {"__init__"},
-            {"simulation", "simulation.generative", "simulation.device", "plotting", "terminal"},
-            {"demo"},
+            {
+                "simulation",
+                "simulation.generative",
+                "simulation.arm",
+                "simulation.tasks",
+                "simulation.device",
+                "simulation.dynamics",
+                "simulation.subjects",
+                "simulation.experiment",
+                "simulation.one_axis",
+                "plotting",
+                "terminal",
+            },
+            {"demo", "simulation.command"},
             {"cli"},
             {"__main__"},
         ),
@@ -52,7 +64,17 @@ FAMILIES = (
     ("kernels.stationary", "kernels.derivative", "kernels.warped", "kernels.impedance", "kernels"),
     ("engines.dense", "engines.closed_loop", "engines.pointwise", "engines"),
     ("baselines.naive", "baselines.without_residual", "baselines"),
-    ("simulation.generative", "simulation.device", "simulation"),
+    (
+        "simulation.generative",
+        "simulation.arm",
+        "simulation.tasks",
+        "simulation.device",
+        "simulation.dynamics",
+        "simulation.subjects",
+        "simulation.experiment",
+        "simulation.one_axis",
+        "simulation",
+    ),
 )
 
 #: Only the command line and its demo show, draw or simulate anything.
@@ -63,7 +85,14 @@ PRESENTATION = {
     "plotting",
     "simulation",
     "simulation.generative",
+    "simulation.arm",
+    "simulation.tasks",
     "simulation.device",
+    "simulation.dynamics",
+    "simulation.subjects",
+    "simulation.experiment",
+    "simulation.command",
+    "simulation.one_axis",
 }
 
 #: What a kernel may know of this package: other kernels. They are to be taken into other people's code.
@@ -71,8 +100,9 @@ FREE = ("kernels.", "evaluation.metrics", "errors")
 
 #: Libraries that only some layers may load, for they are slow or have no place elsewhere.
 CONFINED = {
-    "typer": {"cli"},
-    "rich": {"cli", "terminal"},
+    "typer": {"cli", "simulation.command"},
+    "rich": {"cli", "simulation.command", "terminal"},
+    "numba": {"simulation.dynamics"},
     "matplotlib": {"plotting"},
     "pydantic": {"config"},
     "yaml": {"config"},

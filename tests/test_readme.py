@@ -12,8 +12,9 @@ import pytest
 import yaml
 
 from bayes_impedance.config import parse_config, shipped_configurations
-from bayes_impedance.demo import TRUTH, write_log
+from bayes_impedance.demo import TRUTH
 from bayes_impedance.simulation.generative import as_recording, draw_force, repeated_motion
+from bayes_impedance.writer import write_log
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")

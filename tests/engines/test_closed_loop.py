@@ -22,8 +22,9 @@ from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.posterior import compute_posterior
 from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.priors import ForceModel, build_force_model
-from bayes_impedance.simulation.device import STEP, Admittance, Arm, Signal, held_impedance
+from bayes_impedance.simulation.device import Admittance
 from bayes_impedance.simulation.generative import draw_force, repeated_motion
+from bayes_impedance.simulation.one_axis import STEP, ConstantImpedance, Signal, held_impedance
 from bayes_impedance.training import objective, observations
 from bayes_impedance.trajectory_mean import TrajectoryMean
 
@@ -147,7 +148,7 @@ def test_known_mass_leaves_the_plain_jacobian() -> None:
 
 def test_determinant_of_a_loop_that_holds_its_force_is_that_of_the_mass() -> None:
     """∂u/∂(what the force holds beside the impedance), column by column."""
-    arm, device, n = Arm(), Admittance(), 40
+    arm, device, n = ConstantImpedance(), Admittance(), 40
     time = STEP * np.arange(n)
     still, nothing = Signal(np.zeros(1), np.ones(1), np.zeros(1)), np.zeros(n)
     columns = [held_impedance(arm, device, still, nothing, unit, time)[1] for unit in np.eye(n)]
@@ -158,7 +159,7 @@ def test_determinant_of_a_loop_that_holds_its_force_is_that_of_the_mass() -> Non
 
 def test_determinant_of_a_loop_whose_force_is_smooth_has_half_a_step_of_both_dampings() -> None:
     """∂(u + k x + d ẋ + m ẍ)/∂u at samples between which u is a straight line."""
-    arm, device, n, step, fine = Arm(), Admittance(), 60, 0.04, 200
+    arm, device, n, step, fine = ConstantImpedance(), Admittance(), 60, 0.04, 200
     grid = np.arange(n * fine - fine + 1) / fine
     columns = []
     for unit in np.eye(n):
