@@ -136,7 +136,8 @@ def demo(
 ) -> None:
     """Do the main job on a simulated experiment whose truth is known: train, infer, evaluate, draw.
 
-    Five perturbed repetitions of a figure of eight are drawn from the generative model; four train, the fifth tests.
+    A simulated arm traces a figure of eight five times on a device that perturbs it; four repetitions train, the fifth
+    tests.
     """
     console = Console()
     check_replaceable(out / "model", METADATA)

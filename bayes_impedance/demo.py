@@ -8,25 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-from bayes_impedance.config import Config, load_config, parse_config
+from bayes_impedance.config import Config, load_config
 from bayes_impedance.preprocessing import PreparedLog
-from bayes_impedance.simulation.generative import as_recording, draw_force, repeated_motion
+from bayes_impedance.simulation.arm import arm_with
+from bayes_impedance.simulation.device import BandLimitedForce
+from bayes_impedance.simulation.experiment import Experiment, simulate
+from bayes_impedance.simulation.subjects import Subject
+from bayes_impedance.simulation.tasks import FigureEight, Pace
 from bayes_impedance.writer import write_log
 
 REPETITIONS = 5
-
-#: What the data are drawn from; the model that is trained starts elsewhere (`configs/phase.yaml`).
-TRUTH: dict[str, object] = {
-    "model": {
-        "trajectory_input": "phase",
-        "desired_trajectory": {"mean": "reference", "sd": 0.015, "length_scale": {"phase": 0.12}},
-        "stiffness": {"level": 180, "log_sd": 0.3, "input": ["phase"], "length_scale": {"phase": 0.2}},
-        "damping": {"level": 14, "log_sd": 0.3, "input": ["phase"], "length_scale": {"phase": 0.2}},
-        "mass": {"level": 1.3, "sd": 0.2},
-        "residual": {"sd": 0.4, "input": ["position", "velocity"]},
-        "noise_sd": 0.1,
-    }
-}
+#: Of the path [m]: here stiffness and mass of the arm hardly couple the axes, which the model takes as independent.
+CENTRE = (0.275, 0.2)
 
 
 @dataclass(frozen=True)
@@ -38,20 +31,25 @@ class Recording:
     config: Config
 
 
-def record(folder: Path, seed: int = 0) -> Recording:
-    """Write `training.csv` (four repetitions) and `testing.csv` (a fifth) into `folder`.
-
-    The motion is perturbed; force is drawn from the generative model, and the truth stands beside it.
-    """
-    motion = repeated_motion(
-        repetitions=REPETITIONS, duration=4.0, rate=100.0, displacement_sd=0.012, seed=seed
+def experiment(trials: int = REPETITIONS, round_duration: float = 4.0) -> Experiment:
+    """A person who traces a figure of eight once a trial, on a device that perturbs the hand with 2 N."""
+    return Experiment(
+        [Subject("0", arm_with("low"), Pace(round_duration))],
+        FigureEight(CENTRE, width=0.12, height=0.08),
+        trials,
+        repetitions=1,
+        perturbation=BandLimitedForce(2.0),
     )
-    log = as_recording(draw_force(parse_config(TRUTH), motion, seed))
+
+
+def record(folder: Path, seed: int = 0) -> Recording:
+    """Write `training.csv` (four repetitions) and `testing.csv` (a fifth) into `folder`, the truth beside."""
+    log = simulate(experiment(), seed)
     training, testing = folder / "training.csv", folder / "testing.csv"
     write_log(log.select(range(REPETITIONS - 1)), training)
     write_log(log.select([REPETITIONS - 1]), testing)
-    # Half the usual rate: the displacements end at 2 Hz, and the demo should end within a minute.
-    return Recording(training, testing, load_config("phase", ["preprocessing.rate=12.5"]))
+    # Half the usual rate: the perturbation ends at 4 Hz, and the demo should end within a minute.
+    return Recording(training, testing, load_config("admittance", ["preprocessing.rate=12.5"]))
 
 
 def truth_errors(posterior_of: Callable[[str], np.ndarray], log: PreparedLog) -> dict[str, float]:

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from oracles import TRUTH
 
 from bayes_impedance.config import Config, load_config, parse_config
-from bayes_impedance.demo import TRUTH
 from bayes_impedance.errors import BayesImpedanceWarning
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.persistence import save_model

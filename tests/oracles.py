@@ -351,6 +351,19 @@ def condition(
 
 # --- from a configuration and a log ------------------------------------------------------------------
 
+#: What data of tests are drawn from; the models that are trained on them start elsewhere (`configs/phase.yaml`).
+TRUTH: dict[str, object] = {
+    "model": {
+        "trajectory_input": "phase",
+        "desired_trajectory": {"mean": "reference", "sd": 0.015, "length_scale": {"phase": 0.12}},
+        "stiffness": {"level": 180, "log_sd": 0.3, "input": ["phase"], "length_scale": {"phase": 0.2}},
+        "damping": {"level": 14, "log_sd": 0.3, "input": ["phase"], "length_scale": {"phase": 0.2}},
+        "mass": {"level": 1.3, "sd": 0.2},
+        "residual": {"sd": 0.4, "input": ["position", "velocity"]},
+        "noise_sd": 0.1,
+    }
+}
+
 MODEL = {
     "trajectory_input": "phase",
     "desired_trajectory": {

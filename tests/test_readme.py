@@ -12,8 +12,8 @@ import pytest
 import yaml
 
 from bayes_impedance.config import parse_config, shipped_configurations
-from bayes_impedance.demo import TRUTH
-from bayes_impedance.simulation.generative import as_recording, draw_force, repeated_motion
+from bayes_impedance.demo import experiment
+from bayes_impedance.simulation.experiment import simulate
 from bayes_impedance.writer import write_log
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -29,8 +29,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder like the one that `make demo` leaves, with a smaller experiment in it."""
     folder = tmp_path_factory.mktemp("readme")
     (folder / "demo").mkdir()
-    motion = repeated_motion(repetitions=3, duration=2.0, rate=50.0, axes=("x",), displacement_sd=0.012)
-    log = as_recording(draw_force(parse_config(TRUTH), motion, seed=0))
+    log = simulate(experiment(trials=3, round_duration=2.0), seed=0)
     write_log(log.select([0, 1]), folder / "demo" / "training.csv")
     write_log(log.select([2]), folder / "demo" / "testing.csv")
     return folder

@@ -8,7 +8,7 @@ from bayes_impedance.features import FeatureMap, baseline_components, label_tria
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.posterior import Posterior, compute_posterior
 from bayes_impedance.preprocessing import PreparedLog
-from bayes_impedance.priors import ForceModel, build_naive_model
+from bayes_impedance.priors import Entry, ForceModel, build_naive_model
 from bayes_impedance.training import Progress, TrainingReport, train
 from bayes_impedance.trajectory_mean import TrajectoryMean
 
@@ -33,6 +33,11 @@ class NaiveModel:
         self.report: TrainingReport = train(
             self._model, features, config.training, config.engine.jitter, progress
         )
+
+    @property
+    def hyperparameters(self) -> tuple[Entry, ...]:
+        """Hyperparameters with unit, hyperprior and value `(axes, 1, 1, components)`."""
+        return self._model.entries
 
     def predict(self, log: PreparedLog) -> Posterior:
         """Force of `log` given the training forces; only the marginal of `Latent.FORCE`."""

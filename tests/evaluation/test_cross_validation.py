@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from oracles import TRUTH
 
 from bayes_impedance.baselines.naive import NaiveModel
 from bayes_impedance.baselines.without_residual import without_residual
 from bayes_impedance.config import parse_config
-from bayes_impedance.demo import TRUTH
 from bayes_impedance.errors import ConfigurationError, LogError, LogWarning, TooManySamplesError
 from bayes_impedance.evaluation import contenders, cross_validation
 from bayes_impedance.evaluation.cross_validation import as_json, cross_validate
