@@ -50,6 +50,7 @@ def test_commands_run_in_the_order_shown(place: Path) -> None:
         line for block in blocks("sh") for line in block.splitlines() if line.startswith("bayes-impedance")
     ]
     assert [command.split()[1] for command in commands] == [
+        "simulate",
         "train",
         "infer",
         "evaluate",
