@@ -24,7 +24,7 @@ from bayes_impedance.features import FeatureMap, label_trials
 from bayes_impedance.identifiability import Support
 from bayes_impedance.posterior import Posterior, compute_posterior
 from bayes_impedance.preprocessing import PreparedLog
-from bayes_impedance.priors import Entry, build_force_model
+from bayes_impedance.priors import ForceModel, build_force_model
 from bayes_impedance.simulation.arm import TABLE_I, arm_with
 from bayes_impedance.simulation.device import Admittance, BandLimitedForce, Perturbation, Unperturbed
 from bayes_impedance.simulation.experiment import Experiment, simulate
@@ -128,38 +128,39 @@ class Competition:
         """Scores of the naive GP, one an axis."""
         return self._scores(self.naive.predict(self.test))
 
-    def scores(
-        self, stiffness: Sequence[float], damping: Sequence[float], intention: tuple[float, float]
-    ) -> list[list[list[Scores]]]:
-        """Scores by stiffness, damping and axis; residual and noise are those of the naive GP."""
-        features = FeatureMap(self.config, self.training.axes)
-        mean = TrajectoryMean.from_training(self.config.model.desired_trajectory, self.training)
-        labels = label_trials(self.training, self.test)
-        target, given = (
-            features(self.test, mean, labels),
-            features(self.training, mean, labels, observed=True),
-        )
-        model = build_force_model(self.config, features)
+    def arm(self, stiffness: float, damping: float, intention: tuple[float, float]) -> ForceModel:
+        """The model at one μ_k and μ_d; residual and noise are those of the naive GP."""
+        model = build_force_model(self.config, FeatureMap(self.config, self.training.axes))
         entries = {entry.name: entry for entry in model.entries}
+        sd, length = intention
+        chosen = {
+            "desired_trajectory.sd": [sd],
+            "desired_trajectory.length_scale": [length, length],
+            # A level is positive.
+            "stiffness.level": [max(stiffness, 1e-9)],
+            "damping.level": [max(damping, 1e-9)],
+        }
         with torch.no_grad():
             for entry in self.naive.hyperparameters:
                 entries[entry.name].raw.copy_(entry.raw)
-            sd, length = intention
-            _set(entries["desired_trajectory.sd"], [sd])
-            _set(entries["desired_trajectory.length_scale"], [length, length])
-        surface = []
-        for k in stiffness:
-            row = []
-            for d in damping:
-                # A level is positive.
-                _set(entries["stiffness.level"], [max(k, 1e-9)])
-                _set(entries["damping.level"], [max(d, 1e-9)])
-                posterior = compute_posterior(
-                    model, self.test, target, given, self.config.engine.jitter, [Latent.FORCE]
-                )
-                row.append(self._scores(posterior))
-            surface.append(row)
-        return surface
+            for name, values in chosen.items():
+                value = torch.tensor(values, dtype=torch.float64)
+                entries[name].raw.copy_(entries[name].inverse(value))
+        return model
+
+    def posterior(self, model: ForceModel, log: PreparedLog, latents: Sequence[Latent]) -> Posterior:
+        """Latents along `log` given the training forces."""
+        features = FeatureMap(self.config, self.training.axes)
+        mean = TrajectoryMean.from_training(self.config.model.desired_trajectory, self.training)
+        labels = label_trials(self.training, log)
+        given = features(self.training, mean, labels, observed=True)
+        target = features(log, mean, labels)
+        return compute_posterior(model, log, target, given, self.config.engine.jitter, latents)
+
+    def scores(self, stiffness: float, damping: float, intention: tuple[float, float]) -> list[Scores]:
+        """Scores at one μ_k and μ_d, one an axis."""
+        model = self.arm(stiffness, damping, intention)
+        return self._scores(self.posterior(model, self.test, [Latent.FORCE]))
 
     def _scores(self, posterior: Posterior) -> list[Scores]:
         force = posterior[Latent.FORCE]
@@ -178,16 +179,12 @@ class Competition:
         ]
 
 
-def _set(entry: Entry, values: list[float]) -> None:
-    with torch.no_grad():
-        entry.raw.copy_(entry.inverse(torch.tensor(values, dtype=torch.float64)))
-
-
 def surfaces(setting: str, intention: str) -> Results:
     """Fig. 3: SMSE and MSLL over the grid, mean over axes, beside those of the naive GP."""
     competition = Competition.of(setting)
     naive = competition.naive_scores()
-    scores = competition.scores(STIFFNESS, DAMPING, INTENTIONS[intention])
+    prior = INTENTIONS[intention]
+    scores = [[competition.scores(k, d, prior) for d in DAMPING] for k in STIFFNESS]
     figures: Results = {"samples": competition.training.n_samples}
     for name in ("smse", "msll"):
         values = np.array([[[getattr(s, name) for s in cell] for cell in row] for row in scores])
@@ -208,7 +205,7 @@ def device_law(mass: float, damping: float) -> Results:
     device = Admittance(damping=damping)
     fine = np.arange(0.0, 30.5, 0.5)
     competition = Competition.of("high", mass, device)
-    scores = competition.scores([0.0], fine.tolist(), LOOSE)[0]
+    scores = [competition.scores(0.0, d, LOOSE) for d in fine.tolist()]
     best = [float(fine[np.argmin([cell[a].smse for cell in scores])]) for a in range(len(AXES))]
     return {"mass": mass, "device_damping": damping, "minimum_at": best, "law": damping * mass / device.mass}
 
