@@ -38,6 +38,9 @@ Array = NDArray[np.float64]
 #: Splines of c: even knots, 20 spans. Columns times φ̇, φ̇² and φ̈, for c of repetitions of different pace, cost more
 #: scatter than they save bias: unseen repetitions of generated motion are predicted worse with them.
 OFFSET_SPLINES = 23
+#: Weight of second differences of c, relative to one sample: matters only at phases without any. A weight that predicts
+#: unseen repetitions best would smooth c more, and what it then lacks of K x_d would be taken from K.
+SMOOTHING = 1e-6
 #: Splines of each entry of K and D.
 IMPEDANCE_SPLINES = 8
 #: Repetitions from which on standard errors are those of the jackknife.
@@ -139,8 +142,8 @@ class EnsembleModel:
     """Ensemble least squares of every group of a log.
 
     `coupled`: K, D and M are full and not presumed symmetric, else they are diagonal. c and the entries of K and D are
-    cubic splines over phase, with penalties on second differences (c) and on first ones (K and D, so that they are
-    constant where nothing speaks for a change); leaving out one repetition at a time chooses both weights (`fit`).
+    cubic splines over phase. First differences of those of K and D are penalised, so that they are constant where
+    nothing speaks for a change; the weight is the one that predicts left-out repetitions best (`fit`).
 
     Where every trial records a perturbation, along every axis, it serves as instrument. On a robot that answers force
     by motion, ẍ holds the force of the same instant, and plain least squares would put something of the robot's law in
@@ -216,7 +219,7 @@ def _estimate(
             _design(samples.phase, motion[:, list(chosen)], splines),
             samples.force[:, a],
             samples.index,
-            _penalties(motion[:, list(chosen)], splines),
+            *_penalties(motion[:, list(chosen)], splines),
             None if instruments is None else _design(samples.phase, instruments[:, list(chosen)], splines),
         )
         for a, chosen in enumerate(columns)
@@ -232,7 +235,7 @@ def _design(phase: Array, motion: Array, splines: tuple[PhaseBasis, PhaseBasis])
 
 
 def _penalties(motion: Array, splines: tuple[PhaseBasis, PhaseBasis]) -> tuple[Array, Array]:
-    """Quadratic forms [N²] of c, and of K and D: differences of coefficients times rms x and rms ẋ."""
+    """Quadratic forms [N²] of c, and of K and D, whose differences of coefficients count times rms x and rms ẋ."""
     offset, impedance = splines
     axes = motion.shape[1]
     changes = [
@@ -241,6 +244,6 @@ def _penalties(motion: Array, splines: tuple[PhaseBasis, PhaseBasis]) -> tuple[A
     free = np.zeros((axes, axes))
     rest = block_diag(*changes, free)
     return (
-        block_diag(offset.penalty(2), np.zeros_like(rest)),
+        block_diag(SMOOTHING * offset.penalty(2), np.zeros_like(rest)),
         block_diag(np.zeros((offset.size, offset.size)), rest),
     )

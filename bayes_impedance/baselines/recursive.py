@@ -83,24 +83,25 @@ class RecursiveLeastSquares:
     def _learn(self, config: Config, trials: Sequence[PreparedTrial]) -> _Learned:
         regressors = _Regressors.of(self._start, config, trials)
         # Once with the noise of the configuration, to learn what is left; once with what was left.
-        for _ in range(2):
-            ends = [states[-1] for states in self._run(regressors, trials)]
-            mean, covariance = ends[-1].mean.copy(), ends[-1].covariance.copy()
-            if regressors.basis is None:
-                mean[:, 0] = np.mean([end.mean[:, 0] for end in ends], axis=0)
-                # How offsets of trials differ is in the residual.
-                covariance[:, 0, :] = covariance[:, :, 0] = 0.0
-            left = np.concatenate(
-                [
-                    (trial.force - regressors.predict(trial, mean))[trial.observed]
-                    for trial in trials
-                    if trial.force is not None
-                ]
-            )
-            # Forces that fit to the last digit would leave nothing to divide by.
-            variance = np.maximum(np.mean(left**2, axis=0), (LEAST_NOISE * config.model.noise_sd.median) ** 2)
-            regressors = replace(regressors, noise=variance)
-        return _Learned(regressors, mean, covariance, variance)
+        left = self._end(regressors, trials).residual_variance
+        # Forces that fit to the last digit would leave nothing to divide by.
+        least = (LEAST_NOISE * config.model.noise_sd.median) ** 2
+        return self._end(replace(regressors, noise=np.maximum(left, least)), trials)
+
+    def _end(self, regressors: _Regressors, trials: Sequence[PreparedTrial]) -> _Learned:
+        """Parameters after the last sample, and what they leave of all forces."""
+        ends = [states[-1] for states in self._run(regressors, trials)]
+        mean, covariance = ends[-1].mean.copy(), ends[-1].covariance.copy()
+        if regressors.basis is None:
+            mean[:, 0] = np.mean([end.mean[:, 0] for end in ends], axis=0)
+            # How offsets of trials differ is in the residual.
+            covariance[:, 0, :] = covariance[:, :, 0] = 0.0
+        left = [
+            (trial.force - regressors.predict(trial, mean))[trial.observed]
+            for trial in trials
+            if trial.force is not None
+        ]
+        return _Learned(regressors, mean, covariance, np.mean(np.square(np.concatenate(left)), axis=0))
 
     def _run(self, regressors: _Regressors, trials: Sequence[PreparedTrial]) -> Iterator[list[_State]]:
         """States after each sample, trial after trial."""

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +10,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 #: Weights of a penalty that are tried, relative to one sample.
-WEIGHTS = tuple(10.0**exponent for exponent in range(-8, 5, 2))
+WEIGHTS = tuple(10.0**exponent for exponent in range(-8, 5))
 #: Relative to the mean square of a regressor: keeps what never moved at zero, and changes nothing else.
 RIDGE = 1e-10
 
@@ -23,14 +21,14 @@ class Regression:
 
     `left_out` `(repetitions, p)`: the same without each repetition in turn; `covariance` `(p, p)`: that of b for
     independent residuals of variance `residual_variance`, the mean square of what is left of each repetition when the
-    others predict it; `weights`: those of the penalties.
+    others predict it; `weight`: that of the penalty.
     """
 
     coefficients: Array
     left_out: Array
     covariance: Array
     residual_variance: float
-    weights: tuple[float, ...]
+    weight: float
 
     @property
     def jackknife(self) -> Array:
@@ -44,19 +42,19 @@ def fit(
     design: Array,
     force: Array,
     repetition: NDArray[np.int64],
-    penalties: Sequence[Array],
+    fixed: Array,
+    chosen: Array,
     instruments: Array | None = None,
 ) -> Regression:
-    """Regression of `force` `(n,)` on `design` X `(n, p)` in the metric of `penalties` P_j `(p, p)`.
+    """Regression of `force` `(n,)` on `design` X `(n, p)` with penalties P_0 and P, `fixed` and `chosen` `(p, p)`.
 
-        b = (X̂ᵀX̂ + n Σ_j λ_j P_j)⁻¹ X̂ᵀu,    X̂ = Z (ZᵀZ)⁻¹ ZᵀX,
+        b = (X̂ᵀX̂ + n P_0 + n λ P)⁻¹ X̂ᵀu,    X̂ = Z (ZᵀZ)⁻¹ ZᵀX,
 
-    with `instruments` Z `(n, q)`, else X̂ = X. The weights λ_j are those of `WEIGHTS` with which u − X̂ b of a repetition
-    is least when all else, both stages, is estimated from the others. X̂ and not X, for in a closed loop the best
+    with `instruments` Z `(n, q)`, else X̂ = X. The weight λ is that of `WEIGHTS` with which u − X̂ b of a repetition is
+    least when all else, both stages, is estimated from the others. X̂ and not X, for in a closed loop the best
     prediction of u from X is not the one by the arm.
     """
-    labels = np.arange(repetition.max() + 1)
-    parts = [repetition == label for label in labels]
+    parts = [repetition == label for label in range(repetition.max() + 1)]
     z = design if instruments is None else instruments
     zz, zx = (np.stack([z[part].T @ other[part] for part in parts]) for other in (z, design))
     zu = np.stack([z[part].T @ force[part] for part in parts])
@@ -74,24 +72,24 @@ def fit(
     own_gram, own_moment = first.mT @ zz @ first, (first.mT @ zu[..., None])[..., 0]
     n = len(force)
 
-    def left_out(weights: tuple[float, ...]) -> Array:
-        penalty = n * np.einsum("j,jpq->pq", weights, np.stack(penalties))
-        return np.asarray(np.linalg.solve(gram + penalty + _ridge(gram), moment[..., None])[..., 0])
+    def left_out(weight: float) -> Array:
+        precision = gram + n * (fixed + weight * chosen) + _ridge(gram)
+        return np.asarray(np.linalg.solve(precision, moment[..., None])[..., 0])
 
-    def loss(weights: tuple[float, ...]) -> float:
-        b = left_out(weights)
+    def loss(weight: float) -> float:
+        b = left_out(weight)
         fitted = np.einsum("gp,gpq,gq->g", b, own_gram, b)
         return float((square - 2.0 * (b * own_moment).sum(-1) + fitted).sum())
 
-    weights = min(product(WEIGHTS, repeat=len(penalties)), key=loss)
-    _, gram_all, moment_all = moments(zz.sum(0), zx.sum(0), zu.sum(0))
-    precision = gram_all + n * np.einsum("j,jpq->pq", weights, np.stack(penalties)) + _ridge(gram_all)
-    others = left_out(weights)
+    weight = min(WEIGHTS, key=loss)
+    others = left_out(weight)
     residual = force - np.einsum("np,np->n", design, others[repetition])
     variance = float(np.mean(residual**2))
-    return Regression(
-        np.linalg.solve(precision, moment_all), others, variance * np.linalg.inv(precision), variance, weights
-    )
+    _, gram_of_all, moment_of_all = moments(zz.sum(0), zx.sum(0), zu.sum(0))
+    precision: Array = gram_of_all + n * (fixed + weight * chosen) + _ridge(gram_of_all)
+    coefficients: Array = np.asarray(np.linalg.solve(precision, moment_of_all))
+    covariance: Array = np.asarray(variance * np.linalg.inv(precision))
+    return Regression(coefficients, others, covariance, variance, weight)
 
 
 def _ridge(gram: Array) -> Array:
