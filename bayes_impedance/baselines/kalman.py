@@ -1,6 +1,8 @@
 """An extended Kalman filter for stiffness, damping and desired position of one axis.
 
-u = k (x_d − x) − d ẋ − m ẍ + ε,    log k, log d, x_d random walks,    m known
+    u = k (x_d − x) − d ẋ − m ẍ + ε
+
+with random walks log k, log d and x_d, and a known mass m.
 """
 
 from __future__ import annotations

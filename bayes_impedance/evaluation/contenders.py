@@ -71,7 +71,12 @@ Trainer = Callable[[Config, PreparedLog, Progress | None], Predictor]
 Check = Callable[[PreparedLog, PreparedLog], None]
 
 
-def _impedance(config: Config, log: PreparedLog, progress: Progress | None) -> Predictor:
+def train_impedance(config: Config, log: PreparedLog, progress: Progress | None) -> Predictor:
+    """An impedance model, fitted.
+
+    Raises:
+        KeyboardInterrupt: the user stopped it.
+    """
     model = ImpedanceModel(config).fit(log, progress)
     _check_finished(model.report)
     return Predictor.of(model)
@@ -100,7 +105,7 @@ def _kalman(config: Config, log: PreparedLog, _: Progress | None) -> Predictor:
     return Predictor(ExtendedKalmanFilter(config, log).predict)
 
 
-def _accept(training: PreparedLog, target: PreparedLog) -> None:
+def accept(training: PreparedLog, target: PreparedLog) -> None:
     """What models refuse they refuse on their own."""
 
 
@@ -115,21 +120,21 @@ def _check_ensemble(training: PreparedLog, target: PreparedLog) -> None:
 
 
 @dataclass(frozen=True)
-class Kind:
+class _Kind:
     """A kind of baseline: its name in tables and JSON, what trains it, and what refuses logs before that."""
 
     name: str
     trainer: Trainer
-    check: Check = _accept
+    check: Check = accept
 
 
-BASELINES: Mapping[Baseline, Kind] = {
-    "naive": Kind("naive", _naive),
-    "without-residual": Kind("impedance_without_residual", _impedance),
-    "ensemble": Kind("ensemble_coupled", partial(_ensemble, coupled=True), _check_ensemble),
-    "ensemble-diagonal": Kind("ensemble_diagonal", partial(_ensemble, coupled=False), _check_ensemble),
-    "rls": Kind("recursive_least_squares", _recursive, _check_estimable),
-    "ekf": Kind("extended_kalman_filter", _kalman, _check_estimable),
+_KINDS: Mapping[Baseline, _Kind] = {
+    "naive": _Kind("naive", _naive),
+    "without-residual": _Kind("impedance_without_residual", train_impedance),
+    "ensemble": _Kind("ensemble_coupled", partial(_ensemble, coupled=True), _check_ensemble),
+    "ensemble-diagonal": _Kind("ensemble_diagonal", partial(_ensemble, coupled=False), _check_ensemble),
+    "rls": _Kind("recursive_least_squares", _recursive, _check_estimable),
+    "ekf": _Kind("extended_kalman_filter", _kalman, _check_estimable),
 }
 
 
@@ -142,8 +147,8 @@ class Contender:
 
     name: str
     config: Config
-    trainer: Trainer = _impedance
-    check: Check = _accept
+    trainer: Trainer = train_impedance
+    check: Check = accept
 
     def train(self, log: PreparedLog, watch: Watch | None = None, where: str = "") -> Predictor:
         """A predictor trained on `log`; `where` precedes its name in the progress.
@@ -169,7 +174,7 @@ def baseline_contenders(config: Config, baselines: Sequence[Baseline]) -> list[C
                 f"baselines: expected some of {', '.join(get_args(Baseline))}, got {baseline!r}; choose among them"
             )
         its = without_residual(config) if baseline == "without-residual" else config
-        kind = BASELINES[baseline]
+        kind = _KINDS[baseline]
         contenders.append(Contender(kind.name, its, kind.trainer, kind.check))
     return contenders
 
@@ -183,7 +188,7 @@ def check_comparable(config: Config, against: Mapping[str, ImpedanceModel]) -> N
         ConfigurationError: they differ, or a name is taken.
     """
     for name, model in against.items():
-        taken = (IMPEDANCE, *(kind.name for kind in BASELINES.values()))
+        taken = (IMPEDANCE, *(kind.name for kind in _KINDS.values()))
         if name in taken:
             raise ConfigurationError(
                 f"against: expected names other than {', '.join(taken)}, got {name!r}; rename that model"
