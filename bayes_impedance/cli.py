@@ -95,6 +95,10 @@ class Competitor(str, Enum):
 
     naive = "naive"
     without_residual = "without-residual"
+    ensemble = "ensemble"
+    ensemble_diagonal = "ensemble-diagonal"
+    rls = "rls"
+    ekf = "ekf"
 
 
 class Split(str, Enum):

@@ -416,7 +416,7 @@ def test_version(command):
         (("trian",), "No such command 'trian'"),
         (("train", "log.csv", "--config", "time", "--out", "m", "--fast"), "No such option"),
         (("infer", "model", "log.csv", "--out", "p.csv", "--given", "nothing"), "is not one of"),
-        (("evaluate", "model", "log.csv", "--baseline", "ensemble"), "is not|Choose from"),
+        (("evaluate", "model", "log.csv", "--baseline", "kalman"), "is not|Choose from"),
         (("evaluate", "model", "--folds", "thirds"), "is not one of"),
         (("demo", "--seed", "-1"), "Invalid value for '--seed'"),
     ],

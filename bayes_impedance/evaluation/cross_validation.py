@@ -63,7 +63,8 @@ def cross_validate(
     deterministic under `training.seed`.
 
     Raises:
-        LogError, ConfigurationError: the log cannot be split so, or a model is not of the same samples.
+        LogError, ConfigurationError: the log cannot be split so, a model is not of the same samples, or a baseline can
+            do nothing with a fold.
         TooManySamplesError, NotPositiveDefiniteError: see `ImpedanceModel.fit`.
     """
     against = against or {}
@@ -80,6 +81,8 @@ def cross_validate(
     check_variation(PreparedLog(prepared.axes, tested), "score against")
     for fold in splits:
         check_variation(fold.training, "train on")
+        for contender in contenders:
+            contender.check(fold.training, fold.target)
     predictions, explained = [], []
     for index, fold in enumerate(splits):
         where = f"fold {index + 1} of {len(splits)}: "

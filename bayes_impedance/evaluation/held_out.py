@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bayes_impedance.baselines.naive import NaiveModel
 from bayes_impedance.errors import LogError, LogWarning
 from bayes_impedance.evaluation.contenders import (
     IMPEDANCE,
@@ -19,12 +18,10 @@ from bayes_impedance.evaluation.contenders import (
     Watch,
     baseline_contenders,
     check_comparable,
-    predict_force,
 )
 from bayes_impedance.evaluation.explained import EXPLAINING, impedance_share
 from bayes_impedance.evaluation.metrics import Prediction, Scores, pooled_score, varies
 from bayes_impedance.features import trial_key
-from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.log import InteractionLog
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.preprocessing import PreparedLog
@@ -68,7 +65,7 @@ def evaluate(
         20
 
     Raises:
-        LogError: the log has no force, or the same force throughout.
+        LogError: the log has no force, or the same force throughout, or a baseline can do nothing with it.
         ConfigurationError: a baseline is unknown, or a model of `against` is not of the same samples.
     """
     against = against or {}
@@ -83,12 +80,14 @@ def evaluate(
         other.prepare(prepared)
         _question_training(name, other, training, prepared)
     others = [Contender(name, other.config) for name, other in against.items() if not other.is_fitted]
-    trained: dict[str, Predictor] = {
-        contender.name: contender.train(training, progress)
-        for contender in (*baseline_contenders(model.config, baselines), *others)
-    }
-    rows = (IMPEDANCE, *(name for name in trained if name not in against), *against)
-    predictors = {name: (fitted | trained)[name] for name in rows}
+    ours = baseline_contenders(model.config, baselines)
+    contenders = (*ours, *others)
+    for contender in contenders:
+        contender.check(training, prepared)
+    predictors = {name: Predictor.of(other) for name, other in fitted.items()}
+    predictors |= {contender.name: contender.train(training, progress) for contender in contenders}
+    rows = (IMPEDANCE, *(contender.name for contender in ours), *against)
+    predictors = {name: predictors[name] for name in rows}
     predictions = predict(predictors, training, prepared, prepared)
     return Evaluation(scored([predictions]), shares(predictors, prepared.axes))
 
@@ -108,15 +107,16 @@ def predict(
 ) -> dict[str, dict[str, Prediction]]:
     """Axis → model → prediction of the known forces of `test`, whose samples are those of `target`."""
     known = np.concatenate([trial.observed for trial in test.trials])
-    marginals = {
-        name: predict_force(predictor, target)[Latent.FORCE] for name, predictor in predictors.items()
-    }
+    forces = {name: predictor.predict(target) for name, predictor in predictors.items()}
     return {
         axis: {
             name: Prediction(
-                marginal.mean[known, a], marginal.sd[known, a], known_force(test, a), known_force(training, a)
+                predicted.mean[known, a],
+                predicted.sd[known, a],
+                known_force(test, a),
+                known_force(training, a),
             )
-            for name, marginal in marginals.items()
+            for name, predicted in forces.items()
         }
         for a, axis in enumerate(test.axes)
     }
@@ -133,11 +133,12 @@ def scored(
 
 
 def shares(predictors: Mapping[str, Predictor], axes: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Axis → model → share of its own training force that impedance explains; a naive GP has no impedance."""
+    """Axis → model → share of its own training force that impedance explains, of impedance models."""
+    models = {name: predictor.model for name, predictor in predictors.items()}
     explained = {
-        name: impedance_share(predictor.posterior(predictor.fitted.log, latents=EXPLAINING))
-        for name, predictor in predictors.items()
-        if not isinstance(predictor, NaiveModel)
+        name: impedance_share(model.posterior(model.fitted.log, latents=EXPLAINING))
+        for name, model in models.items()
+        if model is not None
     }
     return {axis: {name: float(share[a]) for name, share in explained.items()} for a, axis in enumerate(axes)}
 

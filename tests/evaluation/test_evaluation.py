@@ -286,7 +286,12 @@ def one_axis(trial):
 @pytest.mark.parametrize(
     ("config", "baselines", "message"),
     [
-        ([], ["ensemble"], "^baselines: expected some of naive, without-residual, got 'ensemble'; choose"),
+        (
+            [],
+            ["kalman"],
+            "^baselines: expected some of naive, without-residual, ensemble, ensemble-diagonal, rls, ekf, "
+            "got 'kalman'; choose",
+        ),
         (
             ["model.residual=null"],
             ["without-residual"],
