@@ -239,7 +239,8 @@ def _events(
 ) -> list[tuple[float, Array]]:
     """Start and direction of one event in each interval that fits, at a random time of it."""
     events = []
-    for k in range(int(duration // interval)):
+    # Not `//`, which makes 49 of 10 s at .2 s.
+    for k in range(int(duration / interval + 1e-9)):
         angle = 2.0 * math.pi * generator.integers(DIRECTIONS) / DIRECTIONS
         start = k * interval + generator.uniform(0.0, interval - width)
         events.append((start, np.array([math.cos(angle), math.sin(angle)])))
