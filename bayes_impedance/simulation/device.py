@@ -209,7 +209,9 @@ class PositionDisplacement:
         """Refuse displacements that overlap."""
         _at_least_zero("displacement", self)
         if self.ramp == 0:
-            raise SimulationError("displacement.ramp: expected more than 0 s, got 0 s; give the hand time to move")
+            raise SimulationError(
+                "displacement.ramp: expected more than 0 s, got 0 s; give the hand time to move"
+            )
         _spaced(self.width, self.interval)
 
     @property

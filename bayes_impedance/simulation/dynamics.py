@@ -66,7 +66,7 @@ def integrate(arm: Arm, mass: Array, damping: Array, drive: Drive, step: float) 
         _constants(arm, mass, damping, drive.gains),
         arm.tension_of_torque,
         arm.pair_arms,
-        round(arm.reflex_delay / step) if arm.reflex_gain > 0 else 0,
+        round(min(arm.reflex_delay / step, n)) if arm.reflex_gain > 0 else 0,
         step,
         drive.desired,
         drive.tension_noise,

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from arm_oracles import Array, central, euler_lagrange, muscle_torque
+
 from bayes_impedance.errors import SimulationError
 from bayes_impedance.simulation.arm import MUSCLE_STIFFNESS, Arm, arm_with, motion_of_joints
 from bayes_impedance.simulation.subjects import SUBJECTS
@@ -37,9 +37,7 @@ def test_posture_is_the_inverse_of_hand_with_flexed_elbow(arm: Arm, states: tupl
 
 @pytest.mark.parametrize("arm", ARMS.values(), ids=ARMS)
 def test_jacobian_is_the_derivative_of_the_hand(arm: Arm, states: tuple[Array, Array]) -> None:
-    np.testing.assert_allclose(
-        arm.jacobian(states[0]), central(arm.hand, states[0], 1e-6), rtol=0, atol=1e-9
-    )
+    np.testing.assert_allclose(arm.jacobian(states[0]), central(arm.hand, states[0], 1e-6), rtol=0, atol=1e-9)
 
 
 def test_rate_of_the_jacobian_is_its_derivative_along_the_motion(states: tuple[Array, Array]) -> None:

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from arm_oracles import Array, acceleration, integrated, plan, quiet, resting
 from scipy.integrate import simpson
 from scipy.linalg import expm
 
-from arm_oracles import Array, acceleration, integrated, plan, quiet, resting
 from bayes_impedance.errors import SimulationError
 from bayes_impedance.simulation.arm import Arm, arm_with
 from bayes_impedance.simulation.dynamics import Drive, Motion, integrate
@@ -173,6 +173,15 @@ def test_reflex_comes_after_its_delay() -> None:
     same = round(delay / STEP)
     np.testing.assert_array_equal(late[: same + 1], without[: same + 1])
     assert np.abs(late[same + 20 :] - without[same + 20 :]).min() > 0
+
+
+def test_reflex_later_than_the_end_never_comes() -> None:
+    drive = quiet(resting(Arm().posture(HAND), 50), added=np.tile([3.0, 0.0], (50, 1)))
+    without, never = (
+        integrate(arm, MASS, DAMPING, drive, STEP).q
+        for arm in (Arm(), Arm(reflex_gain=1.0, reflex_delay=1.7e308))
+    )
+    np.testing.assert_array_equal(never, without)
 
 
 # --- refusals ------------------------------------------------------------------------------------

@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from arm_oracles import Array
+
 from bayes_impedance.errors import LogError, SimulationError
 from bayes_impedance.log import InteractionLog, Trial
 from bayes_impedance.simulation.arm import TABLE_I, Arm, arm_with
@@ -323,7 +323,9 @@ def test_scaled_arm_keeps_its_proportions() -> None:
 
 def test_subject_is_found_by_name_or_refused() -> None:
     assert find_subject("C") is SUBJECTS["C"]
-    with pytest.raises(SimulationError, match="subject: expected one of A, B, C, got 'D'; choose one of them"):
+    with pytest.raises(
+        SimulationError, match="subject: expected one of A, B, C, got 'D'; choose one of them"
+    ):
         find_subject("D")
 
 
@@ -347,7 +349,8 @@ def test_subject_is_found_by_name_or_refused() -> None:
         (lambda: quick(step=np.nan), "step: expected a finite value > 0, got nan; choose one"),
         (
             lambda: quick(rate=300.0),
-            "rate: expected a whole number of steps of 0.001 s between samples, got 300 Hz; choose a divisor of 1000 Hz",
+            "rate: expected a whole number of steps of 0.001 s between samples, got 300 Hz; choose a divisor of 1000 "
+            "Hz",
         ),
         (lambda: quick(rate=2000.0), "got 2000 Hz; choose a divisor of 1000 Hz"),
         (lambda: quick(rate=1e-320), "got 9.99989e-321 Hz; choose a divisor of 1000 Hz"),
@@ -367,9 +370,7 @@ def test_subject_is_found_by_name_or_refused() -> None:
         ),
     ],
 )
-def test_experiment_that_cannot_be_done_is_refused(
-    arrange: Callable[[], Experiment], sentence: str
-) -> None:
+def test_experiment_that_cannot_be_done_is_refused(arrange: Callable[[], Experiment], sentence: str) -> None:
     with pytest.raises(SimulationError) as caught:
         arrange()
     assert str(caught.value).endswith(sentence)

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-
 from arm_oracles import Array
+
 from bayes_impedance.errors import SimulationError
 from bayes_impedance.log import Trial
 from bayes_impedance.simulation.arm import arm_with
@@ -115,7 +115,9 @@ def test_noise_of_force_moves_the_device_and_is_recorded(ideal: Trial) -> None:
     felt = 0.5 * (noisy.force[1:-1] + noisy.force[:-2])
     np.testing.assert_allclose(force_of_motion(noisy), felt, atol=0.02)
     # The arm gives way to noise, so that of u + n is less than that of n.
-    mass = np.array([[noisy.truth[f"mass_{name}"].mean() for name in row] for row in (("xx", "xy"), ("xy", "yy"))])
+    mass = np.array(
+        [[noisy.truth[f"mass_{name}"].mean() for name in row] for row in (("xx", "xy"), ("xy", "yy"))]
+    )
     share = DEVICE.mass * np.linalg.inv(DEVICE.mass * np.eye(2) + mass)
     jumps = np.diff(noisy.force, axis=0).std(0)
     np.testing.assert_allclose(jumps, 0.5 * np.sqrt(2.0 * np.diag(share @ share.T)), rtol=0.05)
@@ -149,7 +151,9 @@ def test_recorded_motion_and_force_obey_the_device(ideal: Trial) -> None:
     np.testing.assert_allclose(force_of_motion(ideal)[20:], ideal.force[21:-1], atol=1e-3)
     for perturbation in (BandLimitedForce(3.0), PositionDisplacement()):
         trial = recorded(perturbation=perturbation, noise=0.1)
-        jumps = np.abs(np.diff(trial.perturbation, axis=0)).max(1) + np.abs(np.diff(trial.force, axis=0)).max(1)
+        jumps = np.abs(np.diff(trial.perturbation, axis=0)).max(1) + np.abs(np.diff(trial.force, axis=0)).max(
+            1
+        )
         # Away from steps of the servo, of which differences see a half on either side.
         calm = np.maximum(jumps[1:], jumps[:-1]) < 0.1
         assert calm.mean() > 0.5
@@ -160,7 +164,9 @@ def test_recorded_motion_and_force_obey_the_device(ideal: Trial) -> None:
 
 
 def test_band_limited_force_has_its_band_and_deviation() -> None:
-    draws = [BandLimitedForce(2.5, 1.0, 3.0).draw(20_000, STEP, np.random.default_rng(k))[0] for k in range(8)]
+    draws = [
+        BandLimitedForce(2.5, 1.0, 3.0).draw(20_000, STEP, np.random.default_rng(k))[0] for k in range(8)
+    ]
     force = np.stack(draws)
     assert force.shape == (8, 20_000, 2)
     np.testing.assert_allclose(force.std(1).mean(), 2.5, rtol=0.05)

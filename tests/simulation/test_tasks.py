@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 import pytest
+from arm_oracles import Array
 from hypothesis import given
 from hypothesis import strategies as st
 
-from arm_oracles import Array
 from bayes_impedance.errors import SimulationError
 from bayes_impedance.simulation.arm import Arm
 from bayes_impedance.simulation.tasks import (
