@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,9 +25,11 @@ from bayes_impedance.simulation.device import (
 )
 from bayes_impedance.simulation.experiment import Experiment, simulate
 from bayes_impedance.simulation.subjects import SUBJECTS, Subject, find_subject, scaled_arm
-from bayes_impedance.simulation.tasks import FigureEight, Flower, Pace, Path, Reaches
+from bayes_impedance.simulation.tasks import FigureEight, Flower, Pace, Reaches
+from bayes_impedance.simulation.tasks import Path as TaskPath
 
 QUICK = Pace(2.0)
+DOCUMENT = Path(__file__).parents[2] / "docs" / "model.md"
 DEVICE = Admittance()
 
 
@@ -55,19 +58,17 @@ def bits(log: InteractionLog) -> str:
 
 @pytest.mark.parametrize("setting", TABLE_I)
 def test_averages_along_the_flower_are_those_of_table_1(setting: str) -> None:
-    log = simulate(Experiment([Subject(setting, arm_with(setting))], Flower(), trials=2), seed=0)
-    average = {
-        name: [
-            np.concatenate([trial.truth[f"{name}_{axes}"] for trial in log.trials]).mean()
-            for axes in ("xx", "yy")
+    log = simulate(Experiment([Subject(setting, arm_with(setting))], Flower()), seed=0)
+    written = DOCUMENT.read_text(encoding="utf-8")
+    for name, paper in (("damping", "damping"), ("muscle_stiffness", "stiffness")):
+        both = [
+            np.concatenate([trial.truth[f"{name}_{axes}"] for trial in log.trials]) for axes in ("xx", "yy")
         ]
-        for name in ("muscle_stiffness", "damping")
-    }
-    np.testing.assert_allclose(average["muscle_stiffness"], TABLE_I[setting]["stiffness"], rtol=0.1)
-    np.testing.assert_allclose(average["damping"], TABLE_I[setting]["damping"], rtol=0.1)
+        np.testing.assert_allclose([values.mean() for values in both], TABLE_I[setting][paper], rtol=0.08)
+        assert ", ".join(f"{values.mean():.1f} ({values.std():.1f})" for values in both) in written
     for trial in log.trials:
         np.testing.assert_allclose(
-            12.0 * matrix(trial, "damping"), matrix(trial, "muscle_stiffness"), rtol=1e-12
+            12.0 * matrix(trial, "damping"), matrix(trial, "muscle_stiffness"), rtol=0, atol=1e-9
         )
 
 
@@ -109,7 +110,7 @@ def test_force_is_impedance_times_error_and_a_residual(fine: Trial) -> None:
     np.testing.assert_allclose(recovered, fine.force[inside], atol=0.05)
 
 
-def share_of_residual(path: Path, pace: Pace, sd: float, **arm: float) -> float:
+def share_of_residual(path: TaskPath, pace: Pace, sd: float, **arm: float) -> float:
     """‖residual‖ / ‖force‖ of one round without noise."""
     person = Subject("P", arm_with("low", noise=0.0, **arm), pace)
     trial = simulate(Experiment([person], path, 1, 1, BandLimitedForce(sd), sensors=IDEAL), seed=1).trials[0]
