@@ -81,7 +81,7 @@ class Sensor:
 
     def recorded(self, signal: Array, step: float) -> Array:
         """`signal` `(n, axes)` late and in steps of the resolution; before the first sample arrives, that sample."""
-        late = min(round(self.latency / step), len(signal) - 1)
+        late = round(min(self.latency / step, len(signal) - 1))
         shifted = np.concatenate([np.repeat(signal[:1], late, axis=0), signal[: len(signal) - late]])
         return self.resolution * np.round(shifted / self.resolution) if self.resolution else shifted
 
@@ -196,18 +196,22 @@ class PositionDisplacement:
     [s]. `gains` of the servo [N/m, Ns/m]. Source: Burdet, Osu, Franklin, Yoshioka, Milner, Kawato 2000.
 
     Raises:
-        SimulationError: a value is negative, or displacements would overlap.
+        SimulationError: a value is negative, there is no ramp, or displacements would overlap.
     """
 
     amplitude: float = 0.008
     ramp: float = 0.1
     hold: float = 0.15
     interval: float = 1.5
-    gains: tuple[float, float] = (4000.0, 150.0)
+    gains: tuple[float, float] = (20000.0, 400.0)
 
     def __post_init__(self) -> None:
         """Refuse displacements that overlap."""
         _at_least_zero("displacement", self)
+        if self.ramp == 0:
+            raise SimulationError(
+                "displacement.ramp: expected more than 0 s, got 0 s; give the hand time to move"
+            )
         _spaced(self.width, self.interval)
 
     @property
@@ -237,7 +241,8 @@ def _events(
 ) -> list[tuple[float, Array]]:
     """Start and direction of one event in each interval that fits, at a random time of it."""
     events = []
-    for k in range(int(duration // interval)):
+    # Not `//`, which makes 49 of 10 s at .2 s.
+    for k in range(int(duration / interval + 1e-9)):
         angle = 2.0 * math.pi * generator.integers(DIRECTIONS) / DIRECTIONS
         start = k * interval + generator.uniform(0.0, interval - width)
         events.append((start, np.array([math.cos(angle), math.sin(angle)])))

@@ -57,7 +57,7 @@ def integrate(arm: Arm, mass: Array, damping: Array, drive: Drive, step: float) 
     """Motion of an arm with a device of virtual `mass` and `damping` `(2,)` [kg, Ns/m], every `step` [s].
 
     Raises:
-        SimulationError: `step` is too large to be stable, or to resolve a reflex delay.
+        SimulationError: `step` is too large to be stable, or to resolve a reflex delay; or numbers overflow.
     """
     _check_step(arm, mass, damping, drive, step)
     n = len(drive.perturbation)
@@ -66,7 +66,7 @@ def integrate(arm: Arm, mass: Array, damping: Array, drive: Drive, step: float) 
         _constants(arm, mass, damping, drive.gains),
         arm.tension_of_torque,
         arm.pair_arms,
-        round(arm.reflex_delay / step) if arm.reflex_gain > 0 else 0,
+        round(min(arm.reflex_delay / step, n)) if arm.reflex_gain > 0 else 0,
         step,
         drive.desired,
         drive.tension_noise,
@@ -91,11 +91,17 @@ def _check_step(arm: Arm, mass: Array, damping: Array, drive: Drive, step: float
     across = np.swapaxes(jacobian, -1, -2)
     stiffness, eye = arm.joint_stiffness(arm.command(torque)) * (1.0 + arm.reflex_gain), np.eye(2)
     spring, damper = drive.gains if len(drive.servo) else (0.0, 0.0)
-    rate = _largest_rate(
-        arm.inertia(q) + across @ np.diag(mass) @ jacobian,
-        arm.damping_ratio * stiffness + across @ (np.diag(damping) + damper * eye) @ jacobian,
-        stiffness + across @ (spring * eye) @ jacobian,
-    )
+    try:
+        rate = _largest_rate(
+            arm.inertia(q) + across @ np.diag(mass) @ jacobian,
+            arm.damping_ratio * stiffness + across @ (np.diag(damping) + damper * eye) @ jacobian,
+            stiffness + across @ (spring * eye) @ jacobian,
+        )
+    except np.linalg.LinAlgError as error:
+        raise SimulationError(
+            "expected inertia, damping and stiffness within the range of numbers, got some that overflow or vanish; "
+            "choose arm, device and duration of a usual size"
+        ) from error
     if step * rate > STABLE:
         raise SimulationError(
             f"step: expected at most {STABLE / rate:.2g} s, for the fastest mode of arm and device changes at "

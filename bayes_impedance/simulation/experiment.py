@@ -31,6 +31,8 @@ Array = NDArray[np.float64]
 AXES = ("x", "y")
 #: Of integration and of the device's controller [s].
 STEP = 1e-3
+#: Steps of one trial (a kilobyte each while it is simulated) and samples of a log, three hundred bytes each.
+LARGEST_TRIAL, LARGEST_LOG = 1_000_000, 10_000_000
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,8 @@ class Experiment:
     `rate` of the log [Hz]; `step` of integration and controller [s]. A subject is a group of the log.
 
     Raises:
-        SimulationError: a number is out of range, or `rate` does not divide 1 / `step`.
+        SimulationError: a number is out of range, two subjects have one name, `rate` does not divide 1 / `step`, or
+            that would be less than two samples a trial or more than memory is for.
     """
 
     subjects: Sequence[Subject]
@@ -57,6 +60,12 @@ class Experiment:
         """Check what does not depend on the arm."""
         if not self.subjects:
             raise SimulationError("subjects: expected at least one, got none; name one or more")
+        names = [subject.name for subject in self.subjects]
+        for name in names:
+            if names.count(name) > 1:
+                raise SimulationError(
+                    f"subjects: expected names that differ, got {name!r} {names.count(name)} times; rename them"
+                )
         for name in ("trials", "repetitions"):
             if getattr(self, name) < 1:
                 raise SimulationError(f"{name}: expected at least 1, got {getattr(self, name)}; ask for more")
@@ -65,17 +74,37 @@ class Experiment:
                 raise SimulationError(
                     f"{name}: expected a finite value > 0, got {getattr(self, name):g}; choose one"
                 )
-        steps = 1.0 / (self.rate * self.step)
-        if steps < 0.999 or abs(steps - round(steps)) > 1e-6:
+        steps = 1.0 / self.rate / self.step
+        if steps < 0.999 or not math.isfinite(steps) or abs(steps - round(steps)) > 1e-6:
             raise SimulationError(
                 f"rate: expected a whole number of steps of {self.step:g} s between samples, got {self.rate:g} Hz; "
                 f"choose a divisor of {1.0 / self.step:g} Hz"
+            )
+        self._check_length()
+
+    def _check_length(self) -> None:
+        times = [self.repetitions * subject.pace.repetition for subject in self.subjects]
+        if min(times) * self.rate < 2.0:
+            raise SimulationError(
+                f"expected trials of at least two samples, got one of {min(times):g} s at {self.rate:g} Hz; make "
+                "duration or rate larger"
+            )
+        if max(times) / self.step > LARGEST_TRIAL:
+            raise SimulationError(
+                f"expected trials of at most {LARGEST_TRIAL} steps, got one of {max(times):g} s in steps of "
+                f"{self.step:g} s; make duration or repetitions smaller"
+            )
+        samples = self.trials * sum(times) * self.rate
+        if samples > LARGEST_LOG:
+            raise SimulationError(
+                f"expected at most {LARGEST_LOG} samples in a log, got {samples:.3g}; make trials or rate smaller, or "
+                "simulate several logs"
             )
 
     @property
     def every(self) -> int:
         """Steps between samples of the log."""
-        return round(1.0 / (self.rate * self.step))
+        return round(1.0 / self.rate / self.step)
 
 
 def simulate(
@@ -85,8 +114,8 @@ def simulate(
 
     Truth at every sample: desired position, velocity and acceleration, the endpoint matrices of stiffness (at constant
     muscle commands, with the geometric term; `muscle_stiffness` without), damping and mass, and the residual force
-    u − K e − D ė − M ë. Trials are independent draws: the first of ten are the same as if there were but these.
-    `progress` is told how many are done.
+    u − K e − D ė − M ë. Trials are independent draws, named `subject-number`: the first of ten are the same as if there
+    were but these, and a subject's are the same whoever else takes part. `progress` is told how many are done.
 
     Example:
         >>> from bayes_impedance.simulation.tasks import FigureEight, Pace
@@ -99,16 +128,18 @@ def simulate(
         SimulationError: the path is out of reach, the step too large, or a perturbation throws the hand out of reach.
     """
     tasks = [
-        (subject, str(k), seeds)
-        for subject, own in zip(
-            experiment.subjects, np.random.SeedSequence(seed).spawn(len(experiment.subjects)), strict=True
+        (subject, f"{subject.name}-{k}", seeds)
+        for subject in experiment.subjects
+        for k, seeds in enumerate(
+            np.random.SeedSequence(seed, spawn_key=tuple(subject.name.encode())).spawn(experiment.trials)
         )
-        for k, seeds in enumerate(own.spawn(experiment.trials))
     ]
 
     def run(task: tuple[Subject, str, np.random.SeedSequence]) -> Trial:
         subject, name, seeds = task
-        return _trial(experiment, subject, name, np.random.default_rng(seeds))
+        # What overflows is refused where it is found.
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            return _trial(experiment, subject, name, np.random.default_rng(seeds))
 
     # Compiled code and numpy let go of the interpreter, so trials run side by side, each with its own generator.
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
@@ -239,9 +270,9 @@ def _check_reach(plan: _Plan, x: Array) -> None:
     outside = ~((distance >= low) & (distance <= high))
     if outside.any():
         raise SimulationError(
-            f"subject {plan.subject.name}, trial {plan.name}: expected the hand within {low:.2f} and {high:.2f} m of "
-            f"the shoulder, found it outside at {plan.time[outside.argmax()]:.2f} s; make the perturbation smaller or "
-            "the arm stiffer"
+            f"trial {plan.name}: expected the hand between {low:.3f} and {high:.3f} m from the shoulder, found it "
+            f"elsewhere at {plan.time[outside.argmax()]:.3f} s; make perturbation, noise or reflex smaller, or the arm "
+            "stiffer"
         )
 
 

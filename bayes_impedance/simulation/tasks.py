@@ -193,8 +193,8 @@ def minimum_jerk(share: Array) -> tuple[Array, Array, Array]:
 class Pace:
     """How long a repetition takes and how evenly.
 
-    `repetition` [s] on average; `spread`, SD of that from trial to trial as a share of it; `unevenness` in [0, 1):
-    SD of how much quicker a repetition is in one half than in the other.
+    `repetition` [s], its median; `spread`, SD of its logarithm from trial to trial; `unevenness`, SD of the a of `Run`
+    from repetition to repetition: the first half takes the hand (1 + a/π) / (1 − a/π) times as far as the second.
 
     Raises:
         SimulationError: a value is out of range.

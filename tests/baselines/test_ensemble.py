@@ -194,7 +194,7 @@ def loops():
     model = ImpedanceModel.from_config("admittance")
     found = {True: [], False: []}
     for seed in range(10):
-        log = model.prepare(held_device(Arm(), Admittance(), 1.0, seed=seed))
+        log = model.prepare(held_device(ConstantImpedance(), Admittance(), 1.0, seed=seed))
         blind = PreparedLog(log.axes, tuple(replace(trial, perturbation=None) for trial in log.trials))
         for known, given in ((True, log), (False, blind)):
             estimate = EnsembleModel(model.config, given).groups["0"]
@@ -204,7 +204,7 @@ def loops():
 
 
 def test_the_perturbation_as_instrument_removes_the_bias_of_the_loop(loops):
-    truth = np.array([Arm().stiffness, Arm().damping, Arm().mass])
+    truth = np.array([ConstantImpedance().stiffness, ConstantImpedance().damping, ConstantImpedance().mass])
     blind, instrumented = (np.abs(loops[known].mean(axis=0) / truth - 1.0) for known in (False, True))
     assert (blind > [0.15, 0.2, 0.25]).all()
     assert (instrumented < 0.35 * blind).all()
