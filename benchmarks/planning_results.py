@@ -2,8 +2,8 @@
 
 The simulated arm, low and high, traces a figure of eight of 4 s in perturbed repetitions, seen by the shipped
 configuration `admittance` at 12.5 Hz. Planned: the relative width of the 90 % interval of stiffness over a grid of
-designs. Checked: other seeds of a few designs, each trained on whole, against the plan: width, scatter over seeds, error
-against the truth, and coverage of the truth. Widths of scatter and error are 3.29 of their log-SDs.
+designs. Checked: other seeds of a few designs, each trained on whole, against the plan: width, scatter over seeds,
+error against the truth, and coverage of the truth. Widths of scatter and error are 3.29 of their log-SDs.
 """
 
 from __future__ import annotations

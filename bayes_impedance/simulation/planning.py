@@ -1,9 +1,9 @@
 """How many repetitions and how much perturbation an experiment needs for an interval of a wanted width.
 
-Given hyperparameters, the width of a posterior depends on motion, hardly on force, so a simulated session of each design
-tells it without training on each. The hyperparameters themselves depend on the perturbation: a model without coupling
-puts the force that one axis causes along another into its residual, and that force grows with the perturbation. So they
-are trained on a simulated pilot at each perturbation, unless a fitted model brings its own.
+Given hyperparameters, the width of a posterior depends on motion and hardly on force, so a simulated session of each
+design tells it without training on each. The hyperparameters themselves depend on the perturbation: a model without
+coupling puts the force that one axis causes along another into its residual, and that force grows with the
+perturbation. So they are trained on a simulated pilot at each perturbation, unless a fitted model brings its own.
 """
 
 from __future__ import annotations
@@ -135,10 +135,7 @@ class Plan:
         Raises:
             SimulationError: `width` is not positive, or the plan has no such impedance or axis.
         """
-        if not (math.isfinite(width) and width > 0):
-            raise SimulationError(
-                f"width: expected a finite value > 0, got {width:g}; .2 asks for an interval of a fifth of the median"
-            )
+        check_width(width)
         axes = self.axes if axis is None else (axis,)
         found: dict[float, int | None] = {}
         for perturbation in self.perturbations:
@@ -187,6 +184,18 @@ class Plan:
         )
 
 
+def check_width(width: float) -> None:
+    """Refuse a wanted relative width that no interval has.
+
+    Raises:
+        SimulationError: it is not positive and finite.
+    """
+    if not (math.isfinite(width) and width > 0):
+        raise SimulationError(
+            f"width: expected a finite value > 0, got {width:g}; .2 asks for an interval of a fifth of the median"
+        )
+
+
 def plan(
     experiment: Experiment,
     model: ImpedanceModel,
@@ -200,9 +209,9 @@ def plan(
     """Expected intervals of stiffness, damping and mass for each number of `repetitions` at each of `perturbations`.
 
     `experiment` is a template: one subject, task, device, sensors, and the kind of perturbation, whose SD or amplitude
-    [N, m] is replaced by each of `perturbations`. Widths are averaged over `motions` simulated sessions. A fitted `model`
-    keeps its hyperparameters, so it should stem from a perturbation like those planned for; one that is not fitted is
-    trained anew, with one start, on the first `pilot` repetitions of each session. Ctrl-C ends it.
+    [N, m] is replaced by each of `perturbations`. Widths are averaged over `motions` simulated sessions. A fitted
+    `model` keeps its hyperparameters, so it should stem from a perturbation like those planned for; one that is not
+    fitted is trained anew, with one start, on the first `pilot` repetitions of each session. Ctrl-C ends it.
 
     Raises:
         SimulationError: nothing to plan for, a number is out of range, or the template has several subjects or no
@@ -226,7 +235,9 @@ def plan(
         for count in counts:
             expected = _expect(trained, log.select(range(count // rounds)), count, size)
             judged.setdefault((size, count), []).append(expected)
-    return Plan(tuple(_average(each) for motion in judged.values() for each in zip(*motion, strict=True)), unit)
+    return Plan(
+        tuple(_average(each) for motion in judged.values() for each in zip(*motion, strict=True)), unit
+    )
 
 
 def _check(
@@ -242,7 +253,7 @@ def _check(
         )
     if type(experiment.perturbation) not in SIZES:
         raise SimulationError(
-            f"perturbation: expected a kind whose size can be varied, {', '.join(kind.__name__ for kind in SIZES)}, got "
+            f"perturbation: expected a kind with a size to vary, {', '.join(kind.__name__ for kind in SIZES)}, got "
             f"{type(experiment.perturbation).__name__}; choose one of them, of any size"
         )
     if not repetitions or not perturbations:
@@ -256,9 +267,7 @@ def _check(
             )
     for size in perturbations:
         if not (math.isfinite(size) and size >= 0):
-            raise SimulationError(
-                f"perturbations: expected finite values >= 0, got {size:g}; choose others"
-            )
+            raise SimulationError(f"perturbations: expected finite values >= 0, got {size:g}; choose others")
     for name, value, least in (("motions", motions, 1), ("pilot", pilot, 2)):
         if value < least:
             raise SimulationError(f"{name}: expected at least {least} to plan with, got {value}; take more")
@@ -281,7 +290,9 @@ def _started_once(config: Config) -> Config:
     return config.model_copy(update={"training": config.training.model_copy(update={"restarts": 1})})
 
 
-def _expect(model: ImpedanceModel, log: PreparedLog, repetitions: int, perturbation: float) -> list[Expectation]:
+def _expect(
+    model: ImpedanceModel, log: PreparedLog, repetitions: int, perturbation: float
+) -> list[Expectation]:
     """Of the hyperparameters of `model` and the motion and forces of `log` alone."""
     # The log takes the place of the one trained on, whose average path may be that of another task.
     planned = ImpedanceModel(model.config, replace(model.fitted, log=log))
