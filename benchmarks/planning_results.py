@@ -108,15 +108,42 @@ def delivered(fits: Sequence[Results], promised: Plan, repetitions: int, perturb
 
 
 def widths(promised: Plan) -> Results:
-    """Planned widths by quantity, axis and number of repetitions, with their verdicts."""
+    """Planned widths by quantity, axis and number of repetitions, at one perturbation."""
     return {
         f"{latent.value}_{axis}": {
-            str(entry.repetitions): {"width": entry.width, "verdict": entry.support.value}
+            str(entry.repetitions): entry.width
             for entry in promised.along(latent, axis, promised.perturbations[0])
         }
         for latent in LATENTS
         for axis in promised.axes
     }
+
+
+def unexplained(arm: str, perturbation: float) -> Results:
+    """SD of the force that a model without coupling cannot explain, by axis [N].
+
+    Part of it is caused by the other axis, Σ_j W_j,xy e_y, the rest is the residual force of the truth.
+    """
+    log = ImpedanceModel(CONFIG).prepare(simulate(experiment(arm, perturbation, max(REPETITIONS)), SEEDS[0]))
+    found: Results = {}
+    for axis, other in (("x", "y"), ("y", "x")):
+        coupling, residual = [], []
+        for trial in log.trials:
+            b = log.axes.index(other)
+            hand = {
+                "position": trial.position,
+                "velocity": trial.velocity,
+                "acceleration": trial.acceleration,
+            }
+            errors = [trial.truth[f"desired_{name}_{other}"] - value[:, b] for name, value in hand.items()]
+            matrices = [trial.truth[f"{latent.value}_xy"] for latent in LATENTS]
+            coupling.append(np.sum([w * e for w, e in zip(matrices, errors, strict=True)], axis=0))
+            residual.append(trial.truth[f"residual_force_{axis}"])
+        found[axis] = {
+            "coupling": float(np.concatenate(coupling).std()),
+            "residual": float(np.concatenate(residual).std()),
+        }
+    return found
 
 
 def main() -> None:
@@ -131,7 +158,9 @@ def main() -> None:
             figures[arm] = {
                 f"{p:g} N": {
                     "smallest": plans[arm, p].smallest(WANTED)[p],
+                    "verdicts": sorted({entry.support.value for entry in plans[arm, p].expectations}),
                     "planned": widths(plans[arm, p]),
+                    "unexplained_force": unexplained(arm, p),
                     "delivered": {
                         str(r): delivered([fit.result() for fit in fits[arm, p, r]], plans[arm, p], r, p)
                         for r in CHECKED_REPETITIONS

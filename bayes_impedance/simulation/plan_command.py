@@ -33,6 +33,12 @@ KINDS: Mapping[Kind, type[BandLimitedForce] | type[ForcePulses]] = {
 }
 
 
+CAVEAT = (
+    "A width is how far estimates scatter, not how far they may be off: where axes are coupled, as in an arm, a model "
+    "without coupling is biased by more, and no interval knows it."
+)
+
+
 def plan_command(
     repetitions: Annotated[str, typer.Option(help="Numbers of rounds to compare.")] = "2,4,8",
     perturbations: Annotated[
@@ -103,6 +109,7 @@ def plan_command(
     console.print(f"An interval of {width:g} of the median along every axis needs:", highlight=False)
     for sentence in planned.sentences(width):
         console.print(f"  {sentence}", highlight=False)
+    console.print(f"  {CAVEAT}", style="yellow", highlight=False)
     if figure is not None:
         save_figure(plot_plan(planned, width), figure)
         console.print(f"wrote {figure}", highlight=False, soft_wrap=True)
