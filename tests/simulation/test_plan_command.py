@@ -1,10 +1,12 @@
 """The command `plan`: its table, figure and JSON, what it takes, and what it refuses."""
 
+import io
 import json
 
 import pytest
+from rich.console import Console
 
-from bayes_impedance import load_config
+from bayes_impedance import load_config, terminal
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.persistence import load_model, save_model
 from bayes_impedance.simulation import plan_command
@@ -116,3 +118,11 @@ def test_what_is_refused(command, tmp_path, monkeypatch, arguments, sentence):
     assert (done.code, done.out) == (2, "")
     assert sentence in " ".join(done.err.split())
     assert list(tmp_path.iterdir()) == []
+
+
+def test_progress_counts_sessions():
+    stream = io.StringIO()
+    with terminal.planning_progress(Console(file=stream, force_terminal=True, width=100)) as hook:
+        hook(2, 9, "5 N")
+    assert "planning" in stream.getvalue()
+    assert "3/9 5 N" in stream.getvalue()
