@@ -1,4 +1,4 @@
-"""The command line: demo, simulate, train, infer, evaluate, show."""
+"""The command line: demo, simulate, plan, train, infer, evaluate, show."""
 
 from __future__ import annotations
 
@@ -40,6 +40,7 @@ from bayes_impedance.plotting import plot_force, save_figure, save_figures
 from bayes_impedance.readers import read_log
 from bayes_impedance.sensitivity import Sensitivity, prior_sensitivity
 from bayes_impedance.simulation.command import simulate_command
+from bayes_impedance.simulation.plan_command import plan_command
 from bayes_impedance.writer import check_table_name, write_table
 
 BAD_INPUT, INTERRUPTED = 2, 130
@@ -174,6 +175,7 @@ def demo(
 
 
 app.command(name="simulate")(simulate_command)
+app.command(name="plan")(plan_command)
 
 
 @app.command()

@@ -1,4 +1,4 @@
-"""Figures: force against prediction, desired against actual trajectory, impedance prior and posterior.
+"""Figures: force against prediction, desired against actual trajectory, impedance prior and posterior, a plan.
 
 Each function returns a matplotlib figure and shows nothing by itself. Every impedance curve carries its
 verdict, so that no stiffness is looked at without it.
@@ -10,21 +10,26 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Literal
 
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
 from numpy.typing import NDArray
 
-from bayes_impedance.identifiability import Verdict, rounded
+from bayes_impedance.identifiability import Support, Verdict, rounded
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
 from bayes_impedance.outputs import whole_file
 from bayes_impedance.posterior import UNITS, Marginal, Posterior
 from bayes_impedance.preprocessing import PreparedTrial
+from bayes_impedance.simulation.planning import Plan
 
 Array = NDArray[np.float64]
 Share = Literal["all", "row", "col"]
 
 POSTERIOR, PRIOR, MEASURED, TRUTH = "#0b6e99", "#9aa5ab", "#1a1a1a", "#c2410c"
+#: Markers of a plan.
+MARKERS = {Support.SUPPORTED: "o", Support.WEAK: "^", Support.PRIOR_ONLY: "x"}
 
 
 def plot_force(
@@ -83,6 +88,41 @@ def plot_impedance(posterior: Posterior, verdicts: Iterable[Verdict], trial: int
             unit = f"{latent.value} [{UNITS[latent]}]"
             _label(ax, a, row, len(IMPEDANCE_ORDER), unit, "phase" if by_phase else "time [s]")
     return _finished(figure, grid, f"Impedance along trial {record.name}, axes {', '.join(posterior.axes)}")
+
+
+def plot_plan(plan: Plan, width: float | None = None, latent: Latent = Latent.STIFFNESS) -> Figure:
+    """Expected relative width of the 90 % interval over repetitions, a line a perturbation, an axis a column.
+
+    Markers show verdicts; `width` is drawn as the one wanted.
+
+    Raises:
+        SimulationError: the plan has no such impedance.
+    """
+    figure, grid = _grid(1, len(plan.axes), sharex="all", sharey="row", width=4.6, height=3.4)
+    shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.85, len(plan.perturbations)))
+    for a, axis in enumerate(plan.axes):
+        ax = grid[0][a]
+        for perturbation, colour in zip(plan.perturbations, shades, strict=True):
+            line = plan.along(latent, axis, perturbation)
+            label = f"{perturbation:g} {plan.unit}"
+            ax.plot([entry.repetitions for entry in line], [e.width for e in line], color=colour, label=label)
+            for support, marker in MARKERS.items():
+                found = [entry for entry in line if entry.support is support]
+                ax.plot([e.repetitions for e in found], [e.width for e in found], marker, color=colour, ms=5)
+        for support, marker in MARKERS.items():
+            ax.plot([], [], marker, color=MEASURED, ms=5, label=support.value)
+        if width is not None:
+            ax.axhline(width, color=TRUTH, ls="--", lw=1.2, label="wanted")
+        ax.set_xscale("log")
+        ax.set_yscale("log")
+        ax.set_xticks(plan.repetitions, [str(count) for count in plan.repetitions])
+        ax.xaxis.set_minor_locator(NullLocator())
+        ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
+        ax.yaxis.set_major_formatter("{x:g}")
+        ax.yaxis.set_minor_locator(NullLocator())
+        ax.set_title(f"{latent.value} {axis}{axis}", fontsize=9)
+        _label(ax, a, 0, 1, "width of the 90 % interval / median", "repetitions")
+    return _finished(figure, grid, f"Expected intervals of {latent.value}, by perturbation")
 
 
 def save_figures(

@@ -15,11 +15,14 @@ from rich.table import Table
 from bayes_impedance.config import TrainingConfig
 from bayes_impedance.evaluation.held_out import Evaluation
 from bayes_impedance.identifiability import Support, Verdict, caveat, rounded
+from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.posterior import Posterior
 from bayes_impedance.priors import Entry
 from bayes_impedance.sensitivity import Effect, Refit, Sensitivity, in_sds
 from bayes_impedance.sensitivity import Progress as SensitivityHook
+from bayes_impedance.simulation.planning import Plan
+from bayes_impedance.simulation.planning import Progress as PlanningHook
 from bayes_impedance.training import Progress as ProgressHook
 
 COLOURS = {Support.SUPPORTED: "green", Support.WEAK: "yellow", Support.PRIOR_ONLY: "red"}
@@ -45,17 +48,25 @@ def training_progress(console: Console, config: TrainingConfig, what: str) -> It
 @contextmanager
 def sensitivity_progress(console: Console) -> Iterator[SensitivityHook]:
     """A bar over changes of priors; hidden where the output is no terminal."""
-    columns = (
-        TextColumn("prior sensitivity"),
-        BarColumn(),
-        TextColumn("{task.description}"),
-        TimeElapsedColumn(),
-    )
+    with _step_progress(console, "prior sensitivity") as hook:
+        yield hook
+
+
+@contextmanager
+def planning_progress(console: Console) -> Iterator[PlanningHook]:
+    """A bar over simulated sessions; hidden where the output is no terminal."""
+    with _step_progress(console, "planning") as hook:
+        yield hook
+
+
+@contextmanager
+def _step_progress(console: Console, what: str) -> Iterator[Callable[[int, int, str], None]]:
+    columns = (TextColumn(what), BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
         task = bar.add_task("", total=None)
 
-        def hook(done: int, planned: int, change: str) -> None:
-            bar.update(task, completed=done, total=planned, description=f"{done + 1}/{planned} {change}")
+        def hook(done: int, planned: int, step: str) -> None:
+            bar.update(task, completed=done, total=planned, description=f"{done + 1}/{planned} {step}")
 
         yield hook
 
@@ -83,6 +94,24 @@ def verdict_table(verdicts: Sequence[Verdict]) -> Table:
             f"{v.q05:.4g} … {v.q95:.4g}", f"{v.prior_q05:.3g} … {v.prior_q95:.3g}", rounded(v.contraction),
             f"[{colour}]{_short(v.support)}[/{colour}]",
         )  # fmt: skip
+    return table
+
+
+def planning_table(plan: Plan, latent: Latent = Latent.STIFFNESS) -> Table:
+    """Expected relative widths of one impedance, a row a design and a column an axis, coloured by verdict."""
+    title = f"Width of the 90 % interval of {latent.value}, over its median"
+    table = Table(title=title, title_justify="left")
+    for name in ("perturbation", "repetitions", *(f"{latent.value} {axis}{axis}" for axis in plan.axes)):
+        table.add_column(name, justify="right")
+    for perturbation in plan.perturbations:
+        lines = [plan.along(latent, axis, perturbation) for axis in plan.axes]
+        for design in zip(*lines, strict=True):
+            cells = [
+                f"{entry.width:.2f} [{COLOURS[entry.support]}]{_short(entry.support)}[/{COLOURS[entry.support]}]"
+                for entry in design
+            ]
+            table.add_row(f"{perturbation:g} {plan.unit}", str(design[0].repetitions), *cells)
+        table.add_section()
     return table
 
 

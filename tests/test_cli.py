@@ -22,7 +22,7 @@ from bayes_impedance.persistence import load_model, save_model
 from bayes_impedance.posterior import UNITS
 from bayes_impedance.readers import read_log
 
-COMMANDS = ("demo", "train", "infer", "evaluate", "show")
+COMMANDS = ("demo", "plan", "train", "infer", "evaluate", "show")
 STATISTICS = ("mean", "sd", "q05", "q95")
 VECTORS = ("force", "desired_position", "desired_velocity", "desired_acceleration", "residual_force")
 MATRICES = ("stiffness", "damping", "mass")
@@ -383,6 +383,24 @@ def test_demo_does_not_touch_a_folder_of_somebody_else(command, tmp_path, monkey
                 "--against",
                 "--folds",
                 "last-third",
+                "--json",
+            ),
+        ),
+        (
+            "plan",
+            (
+                "--repetitions",
+                "2,4,8",
+                "--perturbations",
+                "--width",
+                "--config",
+                "admittance",
+                "--set",
+                "--pilot",
+                "MODEL",
+                "--stiffness",
+                "--subject",
+                "--figure",
                 "--json",
             ),
         ),

@@ -56,10 +56,10 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
                 "simulation.subjects",
                 "simulation.experiment",
                 "simulation.one_axis",
-                "plotting",
-                "terminal",
+                "simulation.planning",
             },
-            {"demo", "simulation.command"},
+            {"plotting", "terminal"},
+            {"demo", "simulation.command", "simulation.plan_command"},
             {"cli"},
             {"__main__"},
         ),
@@ -93,8 +93,10 @@ FAMILIES = (
         "simulation.subjects",
         "simulation.experiment",
         "simulation.one_axis",
+        "simulation.planning",
         "simulation",
     ),
+    ("simulation.command", "simulation.plan_command"),
 )
 
 #: Only the command line and its demo show, draw or simulate anything.
@@ -112,6 +114,8 @@ PRESENTATION = {
     "simulation.subjects",
     "simulation.experiment",
     "simulation.command",
+    "simulation.plan_command",
+    "simulation.planning",
     "simulation.one_axis",
 }
 
@@ -120,8 +124,8 @@ FREE = ("kernels.", "evaluation.metrics", "errors")
 
 #: Libraries that only some layers may load, for they are slow or have no place elsewhere.
 CONFINED = {
-    "typer": {"cli", "simulation.command"},
-    "rich": {"cli", "simulation.command", "terminal"},
+    "typer": {"cli", "simulation.command", "simulation.plan_command"},
+    "rich": {"cli", "simulation.command", "simulation.plan_command", "terminal"},
     "numba": {"simulation.dynamics"},
     "matplotlib": {"plotting"},
     "pydantic": {"config"},

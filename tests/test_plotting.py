@@ -7,11 +7,20 @@ from matplotlib.figure import Figure
 
 from bayes_impedance.config import load_config
 from bayes_impedance.errors import OutputError
-from bayes_impedance.identifiability import rounded
+from bayes_impedance.identifiability import Support, rounded
+from bayes_impedance.kernels import Latent
 from bayes_impedance.log import InteractionLog
 from bayes_impedance.model import ImpedanceModel
-from bayes_impedance.plotting import plot_desired_trajectory, plot_force, plot_impedance, save_figures
+from bayes_impedance.plotting import (
+    MARKERS,
+    plot_desired_trajectory,
+    plot_force,
+    plot_impedance,
+    plot_plan,
+    save_figures,
+)
 from bayes_impedance.readers import read_log
+from bayes_impedance.simulation.planning import Expectation, Plan
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -170,6 +179,45 @@ def test_equilibrium_of_a_single_recording_is_prior_only(tiny):
         "damping xx: prior only",
         "damping yy: prior only",
     ]
+
+
+@pytest.mark.parametrize(("width", "latent"), [(0.3, Latent.STIFFNESS), (None, Latent.MASS)])
+def test_plan(width, latent):
+    """Two axes, two perturbations, three numbers of repetitions, each with another verdict."""
+    supports = dict(zip((2, 4, 8), (Support.PRIOR_ONLY, Support.WEAK, Support.SUPPORTED), strict=True))
+    plan = Plan(
+        tuple(
+            Expectation(latent, axis, count, force, (1.0 + a) / count / force, 0.5, support)
+            for a, axis in enumerate("xy")
+            for force in (1.0, 5.0)
+            for count, support in supports.items()
+        ),
+        "N",
+    )
+    figure = plot_plan(plan, width, latent)
+    assert figure.get_suptitle() == f"Expected intervals of {latent.value}, by perturbation"
+    (grid,) = panels(figure, rows=1, columns=2)
+    for a, ax in enumerate(grid):
+        assert ax.get_title() == f"{latent.value} {'xy'[a] * 2}"
+        assert ax.get_xlabel() == "repetitions"
+        assert [text.get_text() for text in ax.get_xticklabels()] == ["2", "4", "8"]
+        found = lines(ax)
+        for force in (1.0, 5.0):
+            expected = [(2, 4, 8), [(1.0 + a) / count / force for count in (2, 4, 8)]]
+            np.testing.assert_allclose(found[f"{force:g} N"], expected)
+        for count, support in supports.items():
+            marked = [
+                line
+                for line in ax.get_lines()
+                if line.get_marker() == MARKERS[support] and list(line.get_xdata()) == [count]
+            ]
+            assert [line.get_ydata()[0] for line in marked] == [
+                (1.0 + a) / count / force for force in (1.0, 5.0)
+            ]
+        assert ("wanted" in found) == (width is not None)
+        if width is not None:
+            assert set(found["wanted"][1]) == {width}
+    assert grid[0].get_ylabel() == "width of the 90 % interval / median"
 
 
 def test_saved_figures(posterior, verdicts, tmp_path):

@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks.closed_loop_results import SEEDS, WAYS, estimate
 from benchmarks.core_results import configuration_of, coverage_of, demo, known_equilibrium
+from benchmarks.planning_results import ARMS, CHECKED_PERTURBATIONS, PERTURBATIONS, planned, widths
 from benchmarks.recordings_results import last_third
 
 RESULTS = Path(__file__).resolve().parent.parent / "results"
@@ -62,6 +63,37 @@ def test_closed_loop() -> None:
     masses = [figures["without_jacobian"][f"{p} N"]["mass"]["bias"] for p in (1, 2, 5)]
     assert masses == sorted(masses)
     assert masses[0] < -0.2
+
+
+def test_planning() -> None:
+    """The plan of one design again, and what docs/model.md says of plans and of what sessions deliver."""
+    figures = committed("planning")["figures"]
+    now = widths(planned("low", 1.0))
+    for name, line in figures["low"]["1 N"]["planned"].items():
+        assert now[name] == pytest.approx(line, rel=0.05)
+    checked = [
+        entry
+        for arm in ARMS
+        for p in CHECKED_PERTURBATIONS
+        for axes in figures[arm][f"{p:g} N"]["delivered"].values()
+        for entry in axes.values()
+    ]
+    assert len(checked) == 16
+    for entry in checked:
+        assert 0.6 < entry["planned_width"] / entry["width"] < 1.7
+        assert 0.6 < entry["planned_width"] / entry["scatter_width"] < 1.7
+        assert entry["error_width"] > 1.2 * entry["width"]
+        assert -0.2 < entry["bias"] < -0.05
+        assert 0.35 < entry["coverage"] < 0.85
+    hopeful = figures["low"]["5 N"]["delivered"]["3"]["x"]
+    assert hopeful["untrained_width"] < 0.5 * hopeful["width"]
+    for arm in ARMS:
+        for axis in "xy":
+            force = [figures[arm][f"{p:g} N"]["unexplained_force"][axis] for p in PERTURBATIONS]
+            assert all(each["coupling"] > 3 * each["residual"] for each in force)
+            assert [each["coupling"] for each in force] == sorted(each["coupling"] for each in force)
+            at_most = figures[arm]["5 N"]["planned"][f"stiffness_{axis}"]["12"]
+            assert at_most > 0.8 * figures[arm]["1 N"]["planned"][f"stiffness_{axis}"]["12"]
 
 
 def test_recordings(shared_data: Path) -> None:

@@ -131,7 +131,7 @@ def simulate_command(
     """
     check_table_name(out)
     check_writable(out)
-    people = _people(stiffness, subject or [])
+    people = find_people(stiffness, subject or [])
     arm_changes: dict[str, float] = {"reflex_gain": reflex_gain, "reflex_delay": reflex_delay}
     if muscle_noise is not None:
         arm_changes["noise"] = muscle_noise
@@ -165,7 +165,12 @@ def simulate_command(
     )  # fmt: skip
 
 
-def _people(stiffness: Setting | None, subjects: Sequence[str]) -> list[Subject]:
+def find_people(stiffness: Setting | None, subjects: Sequence[str]) -> list[Subject]:
+    """Synthetic subjects by name, or somebody with the default arm in one of its settings.
+
+    Raises:
+        SimulationError: both are given, or there is no subject of a name.
+    """
     if stiffness is not None and subjects:
         raise SimulationError(
             "expected --stiffness or --subject, got both, and a subject has a stiffness of their own; leave one out"
