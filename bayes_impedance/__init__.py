@@ -8,7 +8,7 @@ these data, weakly, or prior only.
     from bayes_impedance import ImpedanceModel, read_log
 
     log = read_log("demo/training.csv")
-    model = ImpedanceModel.from_config("phase", ["preprocessing.rate=12.5"]).fit(log)
+    model = ImpedanceModel.from_config("admittance", ["preprocessing.rate=12.5"]).fit(log)
     posterior = model.posterior(log)
     print(posterior["stiffness"].mean[:3], model.verdicts()[0].sentence)
 

@@ -334,7 +334,7 @@ def test_demo_does_the_main_job_and_meets_the_truth(command, tmp_path, monkeypat
     assert max(float(error.rstrip("%")) for error in errors.values()) < 25
     # Four repetitions train, the fifth tests.
     assert len(load_model(out / "model").fitted.log.trials) == 4
-    assert set(pd.read_csv(out / "testing.csv")["trial"]) == {4}
+    assert set(pd.read_csv(out / "testing.csv")["trial"]) == {"0-4"}
     scores = {
         (match[1], match[2]): float(match[3])
         for match in re.finditer(r"│ (x|y)\s+│ (impedance|naive)\s+│\s+\S+ │\s+(\S+) │", done.out)

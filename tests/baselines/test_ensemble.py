@@ -12,8 +12,8 @@ from bayes_impedance.errors import LogError
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.simulation.device import Admittance
-from bayes_impedance.simulation.one_axis import ConstantImpedance, held_device
 from bayes_impedance.simulation.generative import repeated_motion
+from bayes_impedance.simulation.one_axis import ConstantImpedance, held_device
 
 CONFIG = load_config("phase")
 K = np.array([[120.0, -15.0], [-5.0, 90.0]])

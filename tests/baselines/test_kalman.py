@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from oracles import TRUTH
 
 from bayes_impedance.baselines.kalman import ExtendedKalmanFilter
 from bayes_impedance.baselines.phase_basis import PhaseBasis
 from bayes_impedance.config import load_config, parse_config
-from bayes_impedance.demo import TRUTH
 from bayes_impedance.errors import LogError
 from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.simulation.generative import draw_force, repeated_motion
