@@ -15,9 +15,13 @@ import numpy as np
 import torch
 
 from bayes_impedance import ImpedanceModel, InteractionLog, Latent, evaluate, load_config
+from bayes_impedance.baselines.ensemble import EnsembleModel
+from bayes_impedance.baselines.kalman import ExtendedKalmanFilter
 from bayes_impedance.baselines.naive import NaiveModel
+from bayes_impedance.baselines.recursive import RecursiveLeastSquares
 from bayes_impedance.config import Config
 from bayes_impedance.demo import CENTRE as UNCOUPLED
+from bayes_impedance.evaluation.contenders import Baseline
 from bayes_impedance.evaluation.held_out import as_json, known_force
 from bayes_impedance.evaluation.metrics import Prediction, Scores, pooled_score
 from bayes_impedance.features import FeatureMap, label_trials
@@ -28,10 +32,10 @@ from bayes_impedance.priors import ForceModel, build_force_model
 from bayes_impedance.simulation.arm import TABLE_I, arm_with
 from bayes_impedance.simulation.device import Admittance, BandLimitedForce, Perturbation, Unperturbed
 from bayes_impedance.simulation.experiment import Experiment, simulate
-from bayes_impedance.simulation.subjects import Subject
+from bayes_impedance.simulation.subjects import SUBJECTS, Subject, find_subject
 from bayes_impedance.simulation.tasks import CENTRE, FigureEight, Flower, Pace, Path
 from bayes_impedance.trajectory_mean import TrajectoryMean
-from benchmarks.results import Results, commit, committed
+from benchmarks.results import Results, commit
 
 SETTINGS = ("low", "high")
 AXES = ("x", "y")
@@ -231,23 +235,65 @@ def identification(setting: str, posture: str, design: str, seed: int) -> Result
     model = ImpedanceModel(load_config("admittance", ["training.restarts=1", "preprocessing.rate=12.5"])).fit(
         log
     )
+    return beside_truth(model)
+
+
+def beside_truth(model: ImpedanceModel) -> Results:
+    """Path averages of a fitted model by parameter: mean, 90 % interval, verdict and truth."""
     figures: Results = {}
     for verdict in model.verdicts():
         key = f"{verdict.latent.value}_{verdict.axis}{verdict.axis}"
-        truth = np.concatenate([trial.truth[key] for trial in model.fitted.log.trials])
         figures[key] = {
             "mean": verdict.mean,
             "q05": verdict.q05,
             "q95": verdict.q95,
-            "truth": float(truth.mean()),
+            "truth": true_average(model.fitted.log, key),
             "verdict": verdict.support.value,
             "claimed": verdict.support is not Support.PRIOR_ONLY,
         }
     return figures
 
 
+def true_average(log: PreparedLog, key: str) -> float:
+    """Mean of a truth column over the samples of a log."""
+    return float(np.concatenate([trial.truth[key] for trial in log.trials]).mean())
+
+
+def estimators(setting: str, posture: str) -> Results:
+    """Stiffness [N/m] from `repetitions, 2 N`, seed 0: matrices (xx, xy, yx, yy), or xx and yy at the end."""
+    trials, newton = DESIGNS["repetitions, 2 N"]
+    log = session(setting, FigureEight(POSTURES[posture], 0.12, 0.08), trials, 1, 4.0, newton)
+    model = ImpedanceModel(load_config("admittance", ["preprocessing.rate=12.5"]))
+    prepared = model.prepare(log)
+    figures: Results = {"truth": [true_average(prepared, f"stiffness_{c}") for c in ("xx", "xy", "xy", "yy")]}
+    for name, coupled in (("ensemble_coupled", True), ("ensemble_diagonal", False)):
+        (ensemble,) = EnsembleModel(model.config, prepared, coupled).groups.values()
+        k = ensemble.averages()[0]
+        figures[name] = {
+            "value": k.value[0].ravel().tolist(),
+            "standard_error": k.standard_error[0].ravel().tolist(),
+        }
+    for name, recursive in (
+        ("recursive_least_squares", RecursiveLeastSquares), ("extended_kalman_filter", ExtendedKalmanFilter),
+    ):  # fmt: skip
+        track = recursive(model.config, prepared).filter(prepared)[-1]
+        figures[name] = {
+            "value": track.stiffness[-1].tolist(),
+            "standard_error": track.stiffness_sd[-1].tolist(),
+        }
+    return figures
+
+
+def subject(name: str) -> Results:
+    """Path averages for one of the synthetic subjects: ten repetitions of the flower at their own pace, 2 N."""
+    log = simulate(Experiment([find_subject(name)], Flower(), 10, 1, BandLimitedForce(2.0)))
+    config = load_config("admittance", ["training.restarts=1", "preprocessing.rate=6.25"])
+    return beside_truth(ImpedanceModel(config).fit(log))
+
+
 # --- force of unseen trials ----------------------------------------------------------------------
 
+BASELINES: tuple[Baseline, ...] = ("naive", "ensemble", "ensemble-diagonal", "rls", "ekf")
 CONFIGURATIONS = {"phase": "admittance", "position": "position", "position_velocity": "position_velocity"}
 
 
@@ -256,7 +302,7 @@ def unseen_force(setting: str, theta: str) -> Results:
     log = session(setting, Flower(), 6, 1, 10.0, 2.0)
     config = load_config(CONFIGURATIONS[theta], ["training.restarts=1", "preprocessing.rate=12.5"])
     model = ImpedanceModel(config).fit(log.select(range(4)))
-    return as_json(evaluate(model, log.select([4, 5]), ["naive"]))
+    return as_json(evaluate(model, log.select([4, 5]), BASELINES))
 
 
 def main() -> None:
@@ -269,13 +315,16 @@ def main() -> None:
         for theta in CONFIGURATIONS:
             jobs["force", setting, theta] = (unseen_force, (setting, theta))
         for posture in POSTURES:
+            jobs["estimators", setting, posture] = (estimators, (setting, posture))
             for design in DESIGNS:
                 for seed in SEEDS:
                     where = ("identification", setting, posture, design, str(seed))
                     jobs[where] = (identification, (setting, posture, design, seed))
+    for name in SUBJECTS:
+        jobs["subjects", name] = (subject, (name,))
     for mass, damping in ((3.0, 6.0), (1.5, 6.0), (3.0, 12.0)):
         jobs["device_law", f"{mass:g} kg, {damping:g} Ns/m"] = (device_law, (mass, damping))
-    figures = committed("simulated_arm")
+    figures: Results = {}
     with ProcessPoolExecutor(max_workers=os.cpu_count()) as pool:
         running = {where: pool.submit(function, *arguments) for where, (function, arguments) in jobs.items()}
         for where, result in running.items():
