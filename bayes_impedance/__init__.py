@@ -41,3 +41,4 @@ from bayes_impedance.posterior import Posterior as Posterior
 from bayes_impedance.readers import read_log as read_log
 from bayes_impedance.sensitivity import Sensitivity as Sensitivity
 from bayes_impedance.sensitivity import prior_sensitivity as prior_sensitivity
+from bayes_impedance.writer import write_log as write_log

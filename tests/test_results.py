@@ -10,6 +10,7 @@ from benchmarks.closed_loop_results import SEEDS, WAYS, estimate
 from benchmarks.core_results import configuration_of, coverage_of, demo, known_equilibrium
 from benchmarks.planning_results import ARMS, CHECKED_PERTURBATIONS, PERTURBATIONS, planned, widths
 from benchmarks.recordings_results import last_third
+from benchmarks.simulated_arm_results import INTENTIONS, Competition, table_i
 
 RESULTS = Path(__file__).resolve().parent.parent / "results"
 
@@ -63,6 +64,44 @@ def test_closed_loop() -> None:
     masses = [figures["without_jacobian"][f"{p} N"]["mass"]["bias"] for p in (1, 2, 5)]
     assert masses == sorted(masses)
     assert masses[0] < -0.2
+
+
+def test_table_i() -> None:
+    """Average stiffness and damping of both axes and settings within a tenth of the paper's."""
+    figures = committed("simulated_arm")["figures"]["table_i"]
+    for setting in ("low", "high"):
+        assert table_i(setting) == figures[setting]
+        for differences in figures[setting]["relative_difference"].values():
+            assert all(abs(difference) < 0.1 for difference in differences)
+
+
+def test_fig_3() -> None:
+    """Two cells of a surface again, and what notebook 02 says of all of them."""
+    figures = committed("simulated_arm")["figures"]
+    competition, surfaces = Competition.of("low"), figures["fig_3"]["low"]["wide"]
+    for k, d in ((0, 10), (300, 50)):
+        now = competition.scores(k, d, INTENTIONS["wide"])
+        for a, axis in enumerate("xy"):
+            row = surfaces["msll"][axis]["surface"][figures["grid"]["stiffness"].index(k)]
+            assert now[a].msll == pytest.approx(row[figures["grid"]["damping"].index(d)], abs=1e-3)
+    for setting in ("low", "high"):
+        for intention in INTENTIONS:
+            for axis in "xy":
+                assert figures["fig_3"][setting][intention]["msll"][axis]["share_below_naive"] == 1.0
+    for case in figures["device_law"].values():
+        assert all(abs(found / case["law"] - 1.0) < 0.15 for found in case["minimum_at"])
+
+
+def test_identification() -> None:
+    """Only repetitions that the device perturbs support a claim, and without coupling it is true to a tenth."""
+    for setting in committed("simulated_arm")["figures"]["identification"].values():
+        for posture, designs in setting.items():
+            for design, seeds in designs.items():
+                for entries in seeds.values():
+                    assert all(entry["claimed"] == design.endswith("N") for entry in entries.values())
+                    if posture == "uncoupled" and design.endswith("N"):
+                        for name in ("stiffness_xx", "stiffness_yy", "damping_xx", "damping_yy"):
+                            assert abs(entries[name]["mean"] / entries[name]["truth"] - 1.0) < 0.1
 
 
 def test_planning() -> None:
