@@ -34,8 +34,8 @@ KINDS: Mapping[Kind, type[BandLimitedForce] | type[ForcePulses]] = {
 
 
 CAVEAT = (
-    "A width is how far estimates scatter, not how far they may be off: where axes are coupled, as in an arm, a model "
-    "without coupling is biased by more, and no interval knows it."
+    "A width is how far estimates scatter, not how far they may be off: on the simulated arm, whose axes are coupled, "
+    "a model without coupling errs by one to three times as much."
 )
 
 

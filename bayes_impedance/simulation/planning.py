@@ -4,7 +4,7 @@ Given hyperparameters, the width of a posterior depends on motion and hardly on 
 design tells it without training on each. The hyperparameters themselves depend on the perturbation: a model without
 coupling puts the force that one axis causes along another into its residual, and that force grows with the
 perturbation. So they are trained on a simulated pilot at each perturbation, unless a fitted model brings its own.
-A width is how far estimates scatter; what biases them, such as that coupling, no width tells (docs/model.md §11).
+A width is how far estimates scatter; what biases them, no width tells (docs/model.md §11).
 """
 
 from __future__ import annotations
