@@ -56,6 +56,7 @@ def test_commands_run_in_the_order_shown(place: Path) -> None:
         "evaluate",
         "evaluate",
         "show",
+        "plan",
     ]
     for command in commands:
         arguments = [sys.executable, "-m", "bayes_impedance", *shlex.split(command)[1:]]
