@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from statistics import geometric_mean
 from typing import Any
 
 import pytest
@@ -115,12 +116,14 @@ def test_planning() -> None:
         for entry in axes.values()
     ]
     assert len(checked) == 16
-    for entry in checked:
-        assert 0.6 < entry["planned_width"] / entry["width"] < 1.7
-        assert 0.6 < entry["planned_width"] / entry["scatter_width"] < 1.7
-        assert entry["error_width"] > 1.2 * entry["width"]
-        assert -0.2 < entry["bias"] < -0.05
-        assert 0.35 < entry["coverage"] < 0.85
+    # Five seeds tell a scatter to a third; together the sixteen cases tell more.
+    for width in ("width", "scatter_width"):
+        ratios = [entry["planned_width"] / entry[width] for entry in checked]
+        assert all(0.5 < ratio < 2.0 for ratio in ratios)
+        assert 0.8 < geometric_mean(ratios) < 1.25
+    assert geometric_mean(entry["error_width"] / entry["width"] for entry in checked) > 1.5
+    assert all(-0.25 < entry["bias"] < 0.05 for entry in checked)
+    assert all(0.4 < entry["coverage"] < 0.9 for entry in checked)
     hopeful = figures["low"]["5 N"]["delivered"]["3"]["x"]
     assert hopeful["untrained_width"] < 0.5 * hopeful["width"]
     for arm in ARMS:
