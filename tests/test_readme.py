@@ -89,7 +89,8 @@ def figures_of(name: str) -> dict[str, Any]:
 
 
 def test_quoted_figures_are_those_of_the_results() -> None:
-    core, loop, recordings = (figures_of(name) for name in ("core", "closed_loop", "recordings"))
+    names = ("core", "closed_loop", "recordings", "simulated_arm")
+    core, loop, recordings, arm = (figures_of(name) for name in names)
     table = README.split("<!-- figures:")[1].split("<!-- end of figures -->")[0]
     iiwa, scores = core["known_equilibrium"], core["demo"]["scores"]["axes"]
     stiffness, late = iiwa["stiffness"], iiwa["reference_one_second_late"]
@@ -117,6 +118,20 @@ def test_quoted_figures_are_those_of_the_results() -> None:
             for latent in ("force", "desired_position")
         ),
     ]
+    rivals = ("ensemble_coupled", "recursive_least_squares", "extended_kalman_filter")
+    for setting in ("low", "high"):
+        axes = arm["force"][setting]["phase"]["axes"]
+        quoted += [
+            ", ".join(f"{axes[axis][model]['msll']:.2f}" for axis in "xy")
+            for model in ("impedance", "naive", *rivals)
+        ]
+    for posture in ("uncoupled", "paper"):
+        found = arm["estimators"]["low"][posture]
+        ours = arm["identification"]["low"][posture]["repetitions, 2 N"]["0"]
+        pairs = [(found[model]["value"][0], found[model]["value"][-1]) for model in rivals]
+        pairs += [(ours["stiffness_xx"]["mean"], ours["stiffness_yy"]["mean"])]
+        pairs += [(found["truth"][0], found["truth"][3])]
+        quoted += [f"{xx:.0f}, {yy:.0f}" for xx, yy in pairs]
     plain = table.replace("−", "-").replace(" %", "%")
     for figure in quoted:
         assert figure.replace(" %", "%") in plain, figure
