@@ -17,6 +17,8 @@ from rich.console import Console
 from rich.markup import escape
 
 from bayes_impedance import terminal
+from bayes_impedance.commands.plan import plan_command
+from bayes_impedance.commands.simulate import simulate_command
 from bayes_impedance.config import load_config, shipped_configurations
 from bayes_impedance.demo import record, truth_errors
 from bayes_impedance.errors import (
@@ -39,8 +41,6 @@ from bayes_impedance.persistence import METADATA, load_model, save_model
 from bayes_impedance.plotting import plot_force, save_figure, save_figures
 from bayes_impedance.readers import read_log
 from bayes_impedance.sensitivity import Sensitivity, prior_sensitivity
-from bayes_impedance.simulation.command import simulate_command
-from bayes_impedance.simulation.plan_command import plan_command
 from bayes_impedance.writer import check_table_name, write_table
 
 BAD_INPUT, INTERRUPTED = 2, 130

@@ -59,7 +59,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
                 "simulation.planning",
             },
             {"plotting", "terminal"},
-            {"demo", "simulation.command", "simulation.plan_command"},
+            {"demo", "commands", "commands.simulate", "commands.plan"},
             {"cli"},
             {"__main__"},
         ),
@@ -96,7 +96,7 @@ FAMILIES = (
         "simulation.planning",
         "simulation",
     ),
-    ("simulation.command", "simulation.plan_command"),
+    ("commands.simulate", "commands.plan", "commands"),
 )
 
 #: Only the command line and its demo show, draw or simulate anything.
@@ -113,8 +113,8 @@ PRESENTATION = {
     "simulation.dynamics",
     "simulation.subjects",
     "simulation.experiment",
-    "simulation.command",
-    "simulation.plan_command",
+    "commands.simulate",
+    "commands.plan",
     "simulation.planning",
     "simulation.one_axis",
 }
@@ -124,8 +124,8 @@ FREE = ("kernels.", "evaluation.metrics", "errors")
 
 #: Libraries that only some layers may load, for they are slow or have no place elsewhere.
 CONFINED = {
-    "typer": {"cli", "simulation.command", "simulation.plan_command"},
-    "rich": {"cli", "simulation.command", "simulation.plan_command", "terminal"},
+    "typer": {"cli", "commands.simulate", "commands.plan"},
+    "rich": {"cli", "commands.simulate", "commands.plan", "terminal"},
     "numba": {"simulation.dynamics"},
     "matplotlib": {"plotting"},
     "pydantic": {"config"},

@@ -7,9 +7,9 @@ import pytest
 from rich.console import Console
 
 from bayes_impedance import load_config, terminal
+from bayes_impedance.commands import plan as plan_command
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.persistence import load_model, save_model
-from bayes_impedance.simulation import plan_command
 from bayes_impedance.simulation.arm import arm_with
 from bayes_impedance.simulation.device import BandLimitedForce, ForcePulses
 from bayes_impedance.simulation.experiment import Experiment, simulate

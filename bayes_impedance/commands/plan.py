@@ -11,13 +11,13 @@ from typing import Annotated, TypeVar
 import typer
 from rich.console import Console
 
+from bayes_impedance.commands.simulate import Kind, Setting, Task, find_people
 from bayes_impedance.config import load_config, shipped_configurations
 from bayes_impedance.errors import SimulationError
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.outputs import check_writable, whole_file
 from bayes_impedance.persistence import load_model
 from bayes_impedance.plotting import plot_plan, save_figure
-from bayes_impedance.simulation.command import Kind, Setting, Task, find_people
 from bayes_impedance.simulation.device import BandLimitedForce, ForcePulses
 from bayes_impedance.simulation.experiment import Experiment
 from bayes_impedance.simulation.planning import Plan, check_width, plan
