@@ -305,12 +305,18 @@ def subject(name: str) -> Results:
 # --- force of unseen trials ----------------------------------------------------------------------
 
 BASELINES: tuple[Baseline, ...] = ("naive", "ensemble", "ensemble-diagonal", "rls", "ekf")
+#: Path and time of a round [s].
+FORCE_TASKS: dict[str, tuple[Path, float]] = {
+    "flower": (Flower(), 10.0),
+    "figure_eight": (FigureEight(), 4.0),
+}
 CONFIGURATIONS = {"phase": "admittance", "position": "position", "position_velocity": "position_velocity"}
 
 
-def unseen_force(setting: str, theta: str) -> Results:
-    """Scores on two whole trials, after four: the flower, one round of 10 s a trial, 2 N."""
-    log = session(setting, Flower(), 6, 1, 10.0, 2.0)
+def unseen_force(setting: str, task: str, theta: str) -> Results:
+    """Scores on two whole trials of one round, after four, perturbed with 2 N."""
+    path, pace = FORCE_TASKS[task]
+    log = session(setting, path, 6, 1, pace, 2.0)
     config = load_config(CONFIGURATIONS[theta], ["training.restarts=1", "preprocessing.rate=12.5"])
     model = ImpedanceModel(config).fit(log.select(range(4)))
     return as_json(evaluate(model, log.select([4, 5]), BASELINES))
@@ -323,8 +329,9 @@ def main() -> None:
         jobs["table_i", setting] = (table_i, (setting,))
         for intention in INTENTIONS:
             jobs["fig_3", setting, intention] = (surfaces, (setting, intention))
-        for theta in CONFIGURATIONS:
-            jobs["force", setting, theta] = (unseen_force, (setting, theta))
+        for task in FORCE_TASKS:
+            for theta in CONFIGURATIONS:
+                jobs["force", setting, task, theta] = (unseen_force, (setting, task, theta))
         for posture in POSTURES:
             jobs["estimators", setting, posture] = (estimators, (setting, posture))
             for design in DESIGNS:

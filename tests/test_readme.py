@@ -119,12 +119,11 @@ def test_quoted_figures_are_those_of_the_results() -> None:
         ),
     ]
     rivals = ("ensemble_coupled", "recursive_least_squares", "extended_kalman_filter")
-    for setting in ("low", "high"):
-        axes = arm["force"][setting]["phase"]["axes"]
-        quoted += [
-            ", ".join(f"{axes[axis][model]['msll']:.2f}" for axis in "xy")
-            for model in ("impedance", "naive", *rivals)
-        ]
+    for task in ("flower", "figure_eight"):
+        for model in ("impedance", "naive", *rivals):
+            settings = [arm["force"][setting][task]["phase"]["axes"] for setting in ("low", "high")]
+            pairs = [", ".join(f"{axes[axis][model]['msll']:.2f}" for axis in "xy") for axes in settings]
+            quoted.append("; stiff ".join(pairs) if model == "impedance" else "; ".join(pairs))
     for posture in ("uncoupled", "paper"):
         found = arm["estimators"]["low"][posture]
         ours = arm["identification"]["low"][posture]["repetitions, 2 N"]["0"]
