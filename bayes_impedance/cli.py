@@ -36,7 +36,7 @@ from bayes_impedance.identifiability import summarise
 from bayes_impedance.journal import open_journal
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.model import ImpedanceModel
-from bayes_impedance.outputs import check_replaceable, check_writable, prepare_folder, whole_file
+from bayes_impedance.outputs import check_replaceable, check_writable, prepare_folder, write_json
 from bayes_impedance.persistence import METADATA, load_model, save_model
 from bayes_impedance.plotting import plot_force, save_figure, save_figures
 from bayes_impedance.readers import read_log
@@ -332,8 +332,7 @@ def evaluate_command(
         console.print(terminal.evaluation_table(scores))
         content = as_json(scores)
     if json_file is not None:
-        with whole_file(json_file) as temporary:
-            temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        write_json(content, json_file)
         console.print(f"wrote {json_file}", highlight=False, soft_wrap=True)
 
 

@@ -7,7 +7,7 @@ trials, beside the naive GP and the estimators of `bayes_impedance.baselines`.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 
@@ -21,20 +21,19 @@ from bayes_impedance.baselines.naive import NaiveModel
 from bayes_impedance.baselines.recursive import RecursiveLeastSquares
 from bayes_impedance.config import Config
 from bayes_impedance.demo import CENTRE as UNCOUPLED
-from bayes_impedance.evaluation.contenders import Baseline
-from bayes_impedance.evaluation.held_out import as_json, known_force
-from bayes_impedance.evaluation.metrics import Prediction, Scores, pooled_score
-from bayes_impedance.features import FeatureMap, label_trials
+from bayes_impedance.evaluation.contenders import Baseline, Predictor
+from bayes_impedance.evaluation.held_out import as_json, predict, scored
+from bayes_impedance.evaluation.metrics import Scores
+from bayes_impedance.features import FeatureMap
 from bayes_impedance.identifiability import Support
-from bayes_impedance.posterior import Posterior, compute_posterior
+from bayes_impedance.model import Fit
 from bayes_impedance.preprocessing import PreparedLog
-from bayes_impedance.priors import ForceModel, build_force_model
+from bayes_impedance.priors import build_force_model
 from bayes_impedance.simulation.arm import TABLE_I, arm_with
 from bayes_impedance.simulation.device import Admittance, BandLimitedForce, Perturbation, Unperturbed
 from bayes_impedance.simulation.experiment import Experiment, simulate
 from bayes_impedance.simulation.subjects import SUBJECTS, Subject, find_subject
 from bayes_impedance.simulation.tasks import CENTRE, FigureEight, Flower, Pace, Path
-from bayes_impedance.trajectory_mean import TrajectoryMean
 from benchmarks.results import Results, commit
 
 SETTINGS = ("low", "high")
@@ -132,9 +131,9 @@ class Competition:
 
     def naive_scores(self) -> list[Scores]:
         """Scores of the naive GP, one an axis."""
-        return self._scores(self.naive.predict(self.test))
+        return self._scores(Predictor(lambda log: self.naive.predict(log)[Latent.FORCE]))
 
-    def arm(self, stiffness: float, damping: float, intention: tuple[float, float]) -> ForceModel:
+    def arm(self, stiffness: float, damping: float, intention: tuple[float, float]) -> ImpedanceModel:
         """The model at one μ_k and μ_d; residual and noise are those of the naive GP."""
         model = build_force_model(self.config, FeatureMap(self.config, self.training.axes))
         entries = {entry.name: entry for entry in model.entries}
@@ -152,37 +151,15 @@ class Competition:
             for name, values in chosen.items():
                 value = torch.tensor(values, dtype=torch.float64)
                 entries[name].raw.copy_(entries[name].inverse(value))
-        return model
-
-    def posterior(self, model: ForceModel, log: PreparedLog, latents: Sequence[Latent]) -> Posterior:
-        """Latents along `log` given the training forces."""
-        features = FeatureMap(self.config, self.training.axes)
-        mean = TrajectoryMean.from_training(self.config.model.desired_trajectory, self.training)
-        labels = label_trials(self.training, log)
-        given = features(self.training, mean, labels, observed=True)
-        target = features(log, mean, labels)
-        return compute_posterior(model, log, target, given, self.config.engine.jitter, latents)
+        return ImpedanceModel(self.config, Fit(model, self.training, self.naive.report))
 
     def scores(self, stiffness: float, damping: float, intention: tuple[float, float]) -> list[Scores]:
         """Scores at one μ_k and μ_d, one an axis."""
-        model = self.arm(stiffness, damping, intention)
-        return self._scores(self.posterior(model, self.test, [Latent.FORCE]))
+        return self._scores(Predictor.of(self.arm(stiffness, damping, intention)))
 
-    def _scores(self, posterior: Posterior) -> list[Scores]:
-        force = posterior[Latent.FORCE]
-        return [
-            pooled_score(
-                [
-                    Prediction(
-                        force.mean[:, a],
-                        force.sd[:, a],
-                        known_force(self.test, a),
-                        known_force(self.training, a),
-                    )
-                ]
-            )
-            for a in range(len(AXES))
-        ]
+    def _scores(self, predictor: Predictor) -> list[Scores]:
+        predictions = predict({"": predictor}, self.training, self.test, self.test)
+        return [models[""] for models in scored([predictions]).values()]
 
 
 def surfaces(setting: str, intention: str) -> Results:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -506,3 +506,11 @@ def truth_of(log: PreparedLog, name: str) -> np.ndarray:
     return np.stack(
         [np.concatenate([trial.truth[f"{name}_{end}"] for trial in log.trials]) for end in ends], 1
     )
+
+
+def timeless(log: PreparedLog) -> PreparedLog:
+    """`log` without phase."""
+    trials = (
+        replace(trial, phase=None, phase_velocity=None, phase_acceleration=None) for trial in log.trials
+    )
+    return PreparedLog(log.axes, tuple(trials))

@@ -9,6 +9,33 @@ import bayes_impedance
 
 ROOT = Path(bayes_impedance.__file__).parent
 
+#: Modules of two families, each of which imports only those before it.
+BASELINES = (
+    "baselines.naive",
+    "baselines.without_residual",
+    "baselines.phase_basis",
+    "baselines.samples",
+    "baselines.regression",
+    "baselines.instruments",
+    "baselines.track",
+    "baselines.ensemble",
+    "baselines.recursive",
+    "baselines.kalman",
+    "baselines",
+)
+SIMULATION = (
+    "simulation.generative",
+    "simulation.arm",
+    "simulation.tasks",
+    "simulation.device",
+    "simulation.dynamics",
+    "simulation.subjects",
+    "simulation.experiment",
+    "simulation.one_axis",
+    "simulation.planning",
+    "simulation",
+)
+
 #: From the bottom to the top. Within a layer modules do not know each other, unless FAMILIES says so.
 LAYERS: tuple[frozenset[str], ...] = tuple(
     map(
@@ -29,35 +56,14 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
                 "identifiability",
                 "evaluation.explained",
                 "evaluation.folds",
-                "baselines",
-                "baselines.naive",
-                "baselines.phase_basis",
-                "baselines.samples",
-                "baselines.regression",
-                "baselines.instruments",
-                "baselines.track",
-                "baselines.ensemble",
-                "baselines.recursive",
-                "baselines.kalman",
-                "baselines.without_residual",
+                *BASELINES,
             },
             {"model"},
             {"persistence", "evaluation.contenders", "sensitivity"},
             {"evaluation.held_out"},
             {"evaluation", "evaluation.cross_validation"},
             {"__init__"},
-            {
-                "simulation",
-                "simulation.generative",
-                "simulation.arm",
-                "simulation.tasks",
-                "simulation.device",
-                "simulation.dynamics",
-                "simulation.subjects",
-                "simulation.experiment",
-                "simulation.one_axis",
-                "simulation.planning",
-            },
+            SIMULATION,
             {"plotting", "terminal"},
             {"demo", "commands", "commands.simulate", "commands.plan"},
             {"cli"},
@@ -71,53 +77,13 @@ FAMILIES = (
     ("readers.table", "readers"),
     ("kernels.stationary", "kernels.derivative", "kernels.warped", "kernels.impedance", "kernels"),
     ("engines.dense", "engines.closed_loop", "engines.pointwise", "engines"),
-    (
-        "baselines.naive",
-        "baselines.without_residual",
-        "baselines.phase_basis",
-        "baselines.samples",
-        "baselines.regression",
-        "baselines.instruments",
-        "baselines.track",
-        "baselines.ensemble",
-        "baselines.recursive",
-        "baselines.kalman",
-        "baselines",
-    ),
-    (
-        "simulation.generative",
-        "simulation.arm",
-        "simulation.tasks",
-        "simulation.device",
-        "simulation.dynamics",
-        "simulation.subjects",
-        "simulation.experiment",
-        "simulation.one_axis",
-        "simulation.planning",
-        "simulation",
-    ),
+    BASELINES,
+    SIMULATION,
     ("commands.simulate", "commands.plan", "commands"),
 )
 
 #: Only the command line and its demo show, draw or simulate anything.
-PRESENTATION = {
-    "cli",
-    "demo",
-    "terminal",
-    "plotting",
-    "simulation",
-    "simulation.generative",
-    "simulation.arm",
-    "simulation.tasks",
-    "simulation.device",
-    "simulation.dynamics",
-    "simulation.subjects",
-    "simulation.experiment",
-    "commands.simulate",
-    "commands.plan",
-    "simulation.planning",
-    "simulation.one_axis",
-}
+PRESENTATION = {"cli", "commands.simulate", "commands.plan", "demo", "terminal", "plotting", *SIMULATION}
 
 #: What a kernel may know of this package: other kernels. They are to be taken into other people's code.
 FREE = ("kernels.", "evaluation.metrics", "errors")

@@ -24,10 +24,10 @@ from bayes_impedance.baselines.samples import (
     PredictedForce,
     Repetitions,
     check_force,
-    check_groups,
     members,
     motion_of,
     phase_of,
+    predict_trials,
 )
 from bayes_impedance.config import Config
 from bayes_impedance.errors import LogError
@@ -175,8 +175,7 @@ class EnsembleModel:
         Raises:
             LogError: a trial has no phase, or belongs to a group that was not trained on.
         """
-        check_groups(self.groups, log)
-        return PredictedForce.joined([self.groups[trial.group].predict(trial) for trial in log.trials])
+        return predict_trials(self.groups, log)
 
 
 def check_repetitions(log: PreparedLog) -> None:

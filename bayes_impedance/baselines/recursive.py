@@ -22,6 +22,7 @@ from bayes_impedance.baselines.samples import (
     members,
     motion_of,
     phase_of,
+    predict_trials,
 )
 from bayes_impedance.baselines.track import MEMORY, Start, Track
 from bayes_impedance.config import Config
@@ -77,8 +78,7 @@ class RecursiveLeastSquares:
         Raises:
             LogError: no phase where the training log has it, or a group that was not trained on.
         """
-        check_groups(self._groups, log)
-        return PredictedForce.joined([self._groups[trial.group].predict(trial) for trial in log.trials])
+        return predict_trials(self._groups, log)
 
     def _learn(self, config: Config, trials: Sequence[PreparedTrial]) -> _Learned:
         regressors = _Regressors.of(self._start, config, trials)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +22,12 @@ class PredictedForce:
     mean: Array
     sd: Array
 
-    @classmethod
-    def joined(cls, parts: Sequence[PredictedForce]) -> PredictedForce:
-        """Those of several trials, one after another."""
-        return cls(np.concatenate([part.mean for part in parts]), np.concatenate([part.sd for part in parts]))
+
+class Estimated(Protocol):
+    """What is known of a group once it is trained."""
+
+    def predict(self, trial: PreparedTrial) -> PredictedForce:
+        """Force of one trial."""
 
 
 @dataclass(frozen=True)
@@ -111,3 +114,16 @@ def check_groups(known: Collection[str], log: PreparedLog) -> None:
                 f"({', '.join(known)}), got group '{trial.group}'; train on a trial of that group too, or leave the "
                 "estimators out"
             )
+
+
+def predict_trials(groups: Mapping[str, Estimated], log: PreparedLog) -> PredictedForce:
+    """Force of every trial by its group, one after another.
+
+    Raises:
+        LogError: a trial belongs to a group that no estimate is known of.
+    """
+    check_groups(groups, log)
+    parts = [groups[trial.group].predict(trial) for trial in log.trials]
+    return PredictedForce(
+        np.concatenate([part.mean for part in parts]), np.concatenate([part.sd for part in parts])
+    )

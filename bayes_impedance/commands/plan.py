@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, TypeVar
@@ -11,14 +10,13 @@ from typing import Annotated, TypeVar
 import typer
 from rich.console import Console
 
-from bayes_impedance.commands.simulate import Kind, Setting, Task, find_people
+from bayes_impedance.commands.simulate import KINDS, Kind, Setting, Task, find_people
 from bayes_impedance.config import load_config, shipped_configurations
 from bayes_impedance.errors import SimulationError
 from bayes_impedance.model import ImpedanceModel
-from bayes_impedance.outputs import check_writable, whole_file
+from bayes_impedance.outputs import check_writable, write_json
 from bayes_impedance.persistence import load_model
 from bayes_impedance.plotting import plot_plan, save_figure
-from bayes_impedance.simulation.device import BandLimitedForce, ForcePulses
 from bayes_impedance.simulation.experiment import Experiment
 from bayes_impedance.simulation.planning import Plan, check_width, plan
 from bayes_impedance.simulation.subjects import SUBJECTS
@@ -26,12 +24,6 @@ from bayes_impedance.simulation.tasks import TASKS
 from bayes_impedance.terminal import planning_progress, planning_table
 
 Number = TypeVar("Number", int, float)
-
-KINDS: Mapping[Kind, type[BandLimitedForce] | type[ForcePulses]] = {
-    Kind.band_limited: BandLimitedForce,
-    Kind.pulses: ForcePulses,
-}
-
 
 CAVEAT = (
     "A width is how far estimates scatter, not how far they may be off: on the simulated arm, whose axes are coupled, "
@@ -114,8 +106,7 @@ def plan_command(
         save_figure(plot_plan(planned, width), figure)
         console.print(f"wrote {figure}", highlight=False, soft_wrap=True)
     if json_file is not None:
-        with whole_file(json_file) as temporary:
-            temporary.write_text(json.dumps(_as_json(planned, width), indent=2) + "\n", encoding="utf-8")
+        write_json(_as_json(planned, width), json_file)
         console.print(f"wrote {json_file}", highlight=False, soft_wrap=True)
 
 

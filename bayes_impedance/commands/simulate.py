@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from enum import Enum
 from pathlib import Path
@@ -53,6 +53,12 @@ class Kind(str, Enum):
 
     band_limited = "band-limited"
     pulses = "pulses"
+
+
+KINDS: Mapping[Kind, type[BandLimitedForce] | type[ForcePulses]] = {
+    Kind.band_limited: BandLimitedForce,
+    Kind.pulses: ForcePulses,
+}
 
 
 def simulate_command(
@@ -189,6 +195,4 @@ def _perturbation(force: float, kind: Kind, displacement: float) -> Perturbation
         )
     if displacement:
         return PositionDisplacement(displacement)
-    if not force:
-        return Unperturbed()
-    return BandLimitedForce(force) if kind is Kind.band_limited else ForcePulses(force)
+    return KINDS[kind](force) if force else Unperturbed()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,7 +120,7 @@ NO_SERVO: Array = np.empty((0, 5))
 class Unperturbed:
     """No perturbation at all."""
 
-    gains: tuple[float, float] = (0.0, 0.0)
+    gains: ClassVar[tuple[float, float]] = (0.0, 0.0)
 
     def draw(self, n: int, step: float, generator: np.random.Generator) -> tuple[Array, Array]:
         """See `Perturbation`."""
@@ -138,7 +138,7 @@ class BandLimitedForce:
     sd: float
     low: float = 0.3
     high: float = 4.0
-    gains: tuple[float, float] = (0.0, 0.0)
+    gains: ClassVar[tuple[float, float]] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         """Refuse an empty band."""
@@ -172,7 +172,7 @@ class ForcePulses:
     amplitude: float
     width: float = 0.15
     interval: float = 1.0
-    gains: tuple[float, float] = (0.0, 0.0)
+    gains: ClassVar[tuple[float, float]] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         """Refuse pulses that overlap."""

@@ -85,8 +85,8 @@ def _check_step(arm: Arm, mass: Array, damping: Array, drive: Drive, step: float
         raise SimulationError(
             f"step: expected at most the reflex delay of {arm.reflex_delay:g} s, got {step:g} s; choose a smaller step"
         )
-    q = drive.desired[:: max(1, len(drive.desired) // 200), :2]
-    torque = drive.desired[:: max(1, len(drive.desired) // 200), 4:]
+    planned = drive.desired[:: max(1, len(drive.desired) // 200)]
+    q, torque = planned[:, :2], planned[:, 4:]
     jacobian = arm.jacobian(q)
     across = np.swapaxes(jacobian, -1, -2)
     stiffness, eye = arm.joint_stiffness(arm.command(torque)) * (1.0 + arm.reflex_gain), np.eye(2)

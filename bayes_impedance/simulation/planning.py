@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from bayes_impedance.config import Config
+from bayes_impedance.config import replace_value
 from bayes_impedance.engines.dense import check_capacity
 from bayes_impedance.errors import SimulationError
 from bayes_impedance.identifiability import Support
@@ -280,15 +280,11 @@ def _of_size(kind: Perturbation, size: float) -> Perturbation:
 
 
 def _pilot(model: ImpedanceModel, log: PreparedLog) -> ImpedanceModel:
-    trained = ImpedanceModel(_started_once(model.config)).fit(log)
+    # An average over motions needs no best of several restarts.
+    trained = ImpedanceModel(replace_value(model.config, "training.restarts", 1)).fit(log)
     if trained.report.interrupted:
         raise KeyboardInterrupt
     return trained
-
-
-def _started_once(config: Config) -> Config:
-    """An average over motions needs no best of several restarts."""
-    return config.model_copy(update={"training": config.training.model_copy(update={"restarts": 1})})
 
 
 def _expect(

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oracles import TRUTH
+from oracles import TRUTH, timeless
 
 from bayes_impedance.baselines.kalman import ExtendedKalmanFilter
 from bayes_impedance.baselines.phase_basis import PhaseBasis
@@ -29,14 +29,6 @@ KNOWN = load_config(
 def log():
     motion = repeated_motion(repetitions=4, duration=3.0, rate=15.0, seed=5)
     return draw_force(parse_config(TRUTH), motion, seed=5)
-
-
-def timeless(log: PreparedLog) -> PreparedLog:
-    """`log` without phase."""
-    trials = (
-        replace(trial, phase=None, phase_velocity=None, phase_acceleration=None) for trial in log.trials
-    )
-    return PreparedLog(log.axes, tuple(trials))
 
 
 def hidden(trial, samples: slice):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oracles import TRUTH
+from oracles import TRUTH, timeless
 
 from bayes_impedance.baselines.phase_basis import PhaseBasis
 from bayes_impedance.baselines.recursive import RecursiveLeastSquares
@@ -34,16 +34,6 @@ NOISE_SD = 0.2
 def log():
     motion = repeated_motion(repetitions=4, duration=3.0, rate=15.0, seed=5)
     return draw_force(parse_config(TRUTH), motion, seed=5)
-
-
-def timeless(log: PreparedLog) -> PreparedLog:
-    """`log` without phase."""
-    return PreparedLog(
-        log.axes,
-        tuple(
-            replace(trial, phase=None, phase_velocity=None, phase_acceleration=None) for trial in log.trials
-        ),
-    )
 
 
 def rows_of(log: PreparedLog, axis: int, phased: bool):
