@@ -115,6 +115,34 @@ def test_unknown_name_lists_or_suggests_the_shipped_ones(tmp_path):
         load_config(tmp_path / "nothing" / "like" / "it.json")
 
 
+def test_a_file_extends_another(tmp_path):
+    own = tmp_path / "own.yaml"
+    own.write_text("extends: phase\npreprocessing: {rate: 10}\n")
+    assert load_config(own) == load_config("phase", ["preprocessing.rate=10"])
+    other = tmp_path / "folder" / "other.yaml"
+    other.parent.mkdir()
+    other.write_text("extends: ../own.yaml\nlog: {axes: [x]}\n")
+    assert load_config(other, ["training.seed=3"]) == load_config(
+        "phase", ["preprocessing.rate=10", "log.axes=[x]", "training.seed=3"]
+    )
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ("extends: own", "found neither at 'own'"),
+        ("extends: own.yaml", "expected a chain of extends that ends, got one that comes back to this file"),
+        ("extends: [phase]", r"extends: expected the name of one configuration, got \['phase'\]"),
+        ("extends: phase\nlog: {axis: [x]}", "unknown key 'log.axis'; did you mean 'axes'"),
+    ],
+)
+def test_an_extension_that_makes_no_sense_is_refused(tmp_path, content, expected):
+    path = tmp_path / "own.yaml"
+    path.write_text(content)
+    with pytest.raises(ConfigurationError, match=expected):
+        load_config(path)
+
+
 def test_file_of_ones_own(tmp_path):
     path = tmp_path / "own.yaml"
     path.write_text("training: {restarts: 7}\n")
