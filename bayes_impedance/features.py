@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bayes_impedance.config import Component, Config, ModelConfig
+from bayes_impedance.config import Config, ModelConfig
+from bayes_impedance.config.sections import Component
 from bayes_impedance.device import Loop
 from bayes_impedance.errors import ConfigurationError
 from bayes_impedance.kernels.impedance import InputLayout

@@ -18,14 +18,9 @@ from gpytorch.likelihoods import GaussianLikelihood
 from gpytorch.priors import NormalPrior
 from torch import Tensor
 
-from bayes_impedance.config import (
-    LARGEST_LOG_SD,
-    Component,
-    Config,
-    Hyperparameter,
-    ImpedancePrior,
-    LengthScales,
-)
+from bayes_impedance.config import Config, Hyperparameter, ImpedancePrior, LengthScales
+from bayes_impedance.config.model import LARGEST_LOG_SD
+from bayes_impedance.config.sections import Component
 from bayes_impedance.errors import ConfigurationError
 from bayes_impedance.features import UNITS, FeatureMap, baseline_components, theta_components
 from bayes_impedance.kernels.impedance import ImpedanceKernel, InputLayout, InteractionKernel

@@ -8,13 +8,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from bayes_impedance.config import (
-    LARGEST_HYPERPRIOR_LOG_SD,
-    LARGEST_LOG_SD,
-    Config,
-    Hyperparameter,
-    replace_value,
-)
+from bayes_impedance.config import Config, Hyperparameter, replace_value
+from bayes_impedance.config.model import LARGEST_LOG_SD
+from bayes_impedance.config.sections import LARGEST_HYPERPRIOR_LOG_SD
 from bayes_impedance.errors import NotPositiveDefiniteError
 from bayes_impedance.identifiability import Support
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent

@@ -308,7 +308,7 @@ def test_override_that_is_no_yaml():
         ("log.axes=[q]", r"log\.axes\.0: .*'x', 'y' or 'z'\), got 'q'"),
         ("log.axes=[x, x]", r"axes: expected each axis once, got \['x', 'x'\]"),
         ("log.delimiter=ab", r"log\.delimiter: .*at most 1 character\), got 'ab'"),
-        ("log.columns.force=Fx", r"force: expected a column name with \{axis\} in it, got 'Fx'"),
+        ("log.columns.force=Fx", r"force: expected a column name with \{axis\} or \{index\} in it, got 'Fx'"),
         ("log.window={start: 2, end: 2}", r"expected start < end, got start 2 s and end 2 s"),
         ("log.units.force=lbf", r"log\.units\.force: .*got 'lbf'"),
         ("model.residual.input=[]", r"input: expected at least one of time, phase, position, velocity"),

@@ -45,6 +45,17 @@ CONFIG = (
     "config.loading",
     "config",
 )
+READERS = (
+    "readers.table",
+    "readers.cells",
+    "readers.columns",
+    "readers.text",
+    "readers.parquet",
+    "readers.samples",
+    "readers.trials",
+    "readers.read",
+    "readers",
+)
 PREPROCESSING = (
     "preprocessing.prepared",
     "preprocessing.grid",
@@ -61,7 +72,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             {"errors"},
             {*CONFIG, "outputs", "journal"},
             {"log", "evaluation.metrics"},
-            {"readers", "readers.table", *PREPROCESSING, "writer"},
+            {*READERS, *PREPROCESSING, "writer"},
             {"trajectory_mean", "device"},
             {"kernels", "kernels.stationary", "kernels.derivative", "kernels.warped", "kernels.impedance"},
             {"features"},
@@ -93,7 +104,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
 FAMILIES = (
     CONFIG,
     PREPROCESSING,
-    ("readers.table", "readers"),
+    READERS,
     ("kernels.stationary", "kernels.derivative", "kernels.warped", "kernels.impedance", "kernels"),
     ("engines.dense", "engines.closed_loop", "engines.pointwise", "engines"),
     BASELINES,
@@ -116,7 +127,7 @@ CONFINED = {
     "pydantic": set(CONFIG) - {"config"},
     "yaml": {"config.loading"},
     "safetensors": {"persistence"},
-    "pyarrow": {"readers.table"},
+    "pyarrow": {"readers.parquet"},
     "filelock": {"journal"},
 }
 

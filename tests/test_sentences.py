@@ -69,5 +69,5 @@ def test_every_refusal_is_found():
     assert len(REFUSALS) > 90
     assert {place.split(":")[0] for place in (refusal.place for refusal in REFUSALS)} >= {
         "cli.py", "config/loading.py", "journal.py", "log.py", "outputs.py", "persistence.py",
-        "preprocessing/prepare.py", "readers/table.py", "training.py", "trajectory_mean.py",
+        "preprocessing/prepare.py", "readers/text.py", "training.py", "trajectory_mean.py",
     }  # fmt: skip

@@ -20,7 +20,6 @@ from bayes_impedance.config.log import LogConfig as LogConfig
 from bayes_impedance.config.log import ToolConfig as ToolConfig
 from bayes_impedance.config.log import Units as Units
 from bayes_impedance.config.log import Window as Window
-from bayes_impedance.config.model import LARGEST_LOG_SD as LARGEST_LOG_SD
 from bayes_impedance.config.model import DampingPrior as DampingPrior
 from bayes_impedance.config.model import DesiredTrajectoryPrior as DesiredTrajectoryPrior
 from bayes_impedance.config.model import DeviceConfig as DeviceConfig
@@ -28,19 +27,12 @@ from bayes_impedance.config.model import ImpedancePrior as ImpedancePrior
 from bayes_impedance.config.model import LengthScales as LengthScales
 from bayes_impedance.config.model import MassPrior as MassPrior
 from bayes_impedance.config.model import ModelConfig as ModelConfig
-from bayes_impedance.config.model import ProfileName as ProfileName
 from bayes_impedance.config.model import ResidualPrior as ResidualPrior
 from bayes_impedance.config.model import SharedConfig as SharedConfig
 from bayes_impedance.config.model import StiffnessPrior as StiffnessPrior
-from bayes_impedance.config.model import TrajectoryInput as TrajectoryInput
-from bayes_impedance.config.model import TrajectoryMean as TrajectoryMean
 from bayes_impedance.config.preprocessing import PhaseConfig as PhaseConfig
 from bayes_impedance.config.preprocessing import PreprocessingConfig as PreprocessingConfig
 from bayes_impedance.config.preprocessing import Segmentation as Segmentation
 from bayes_impedance.config.preprocessing import Smoother as Smoother
-from bayes_impedance.config.sections import LARGEST_HYPERPRIOR_LOG_SD as LARGEST_HYPERPRIOR_LOG_SD
-from bayes_impedance.config.sections import MEDIANS as MEDIANS
-from bayes_impedance.config.sections import Axis as Axis
-from bayes_impedance.config.sections import Component as Component
 from bayes_impedance.config.sections import Hyperparameter as Hyperparameter
 from bayes_impedance.config.sections import Section as Section

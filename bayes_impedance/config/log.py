@@ -13,6 +13,8 @@ TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 FORCE_UNITS = {"N": 1.0, "mN": 1e-3, "kN": 1e3}
 TORQUE_UNITS = {"Nm": 1.0, "mNm": 1e-3}
 
+#: What has a unit that `Units` names.
+Quantity = Literal["time", "position", "velocity", "acceleration", "force", "torque"]
 #: Columns that hold a vector: their names carry `{axis}` (x, y, z) or `{index}` (0, 1, 2).
 VECTOR_COLUMNS = ("position", "force", "velocity", "acceleration", "reference", "perturbation", "torque")
 
@@ -20,8 +22,8 @@ VECTOR_COLUMNS = ("position", "force", "velocity", "acceleration", "reference", 
 class Columns(Section):
     """Names of the columns of the log. `null` where the log has none.
 
-    `{axis}` stands for x, y or z, `{index}` for 0, 1 or 2. In a file of topics a column is `TOPIC.FIELD`, such as
-    `/robot_state.position[{index}]`; in a file of arrays `PATH[{index}]`, such as `robot/position[{index}]`.
+    `{axis}` stands for x, y or z, `{index}` for 0, 1 or 2. In a file of topics a column is a topic, a point and a
+    field, such as /robot_state.position[{index}]; in a file of arrays a path, such as robot/position[{index}].
     `position` and `time` are required; the optional ones (velocity, acceleration, trial, …) are read when a column
     of that name exists. `time: null` with `log.sampling_rate` where nothing tells the time; `force_time` where force
     and torque have time stamps of their own. `orientation`: three angles or the four parts of a quaternion.
@@ -69,9 +71,7 @@ class Units(Section):
     torque: Literal["Nm", "mNm"] = "Nm"
     angle: Literal["rad", "deg"] = "rad"
 
-    def scale(
-        self, quantity: Literal["time", "position", "velocity", "acceleration", "force", "torque"]
-    ) -> float:
+    def scale(self, quantity: Quantity) -> float:
         """Factor that turns a column of `quantity` into SI."""
         unit = str(getattr(self, quantity)).split("/")[0]
         return (LENGTH_UNITS | TIME_UNITS | FORCE_UNITS | TORQUE_UNITS)[unit]
@@ -110,8 +110,9 @@ class ToolConfig(Section):
     """What hangs on the force sensor between it and the hand; its weight, inertia and bias are taken off.
 
     Either `identify`, a part of the recording [s] in which nobody touches it while the robot turns it about, or
-    the values themselves: `mass` [kg], `center_of_mass` [m] and `bias` [N], `torque_bias` [Nm] in the frame of the sensor. `inertia`:
-    take off m a as well as the weight, for a handle that moves briskly. `gravity` points in the base frame [m/s²].
+    the values themselves: `mass` [kg], `center_of_mass` [m], `bias` [N] and `torque_bias` [Nm] in the frame of the
+    sensor, in the sign of the force of the human. `inertia`: take off m a as well as the weight, for a handle that
+    moves briskly. `gravity`: in the base frame [m/s²].
     """
 
     identify: Window | None = None

@@ -1,3 +1,3 @@
 """Readers: one file a format, one function for all of them."""
 
-from bayes_impedance.readers.table import read_log as read_log
+from bayes_impedance.readers.read import read_log as read_log

@@ -1,0 +1,103 @@
+"""From files to an interaction log: one function for all formats."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from bayes_impedance.config import LogConfig
+from bayes_impedance.errors import LogError
+from bayes_impedance.log import InteractionLog
+from bayes_impedance.readers.cells import brief
+from bayes_impedance.readers.parquet import open_parquet
+from bayes_impedance.readers.table import Opened
+from bayes_impedance.readers.text import open_text
+from bayes_impedance.readers.trials import read_trials
+
+#: How a file of each ending opens.
+OPENERS: dict[str, Callable[[Path, str, LogConfig], Opened]] = {
+    **dict.fromkeys((".csv", ".tsv", ".txt"), open_text),
+    **dict.fromkeys((".parquet", ".pq"), open_parquet),
+}
+
+
+def read_log(
+    paths: str | Path | Sequence[str | Path], config: LogConfig | None = None, *, require_force: bool = True
+) -> InteractionLog:
+    """Interaction log of one or several files, mapped by `config` (default: `LogConfig()`) to SI.
+
+    Without `require_force` a file may lack force.
+
+    Example:
+        >>> import pandas as pd
+        >>> cells = {"time": [0, 10, 20], "position_x": [0.10, 0.11, 0.13], "force_x": [1.5, 1.6, 1.4]}
+        >>> pd.DataFrame(cells).to_csv("log.csv", index=False)
+        >>> log = read_log("log.csv", LogConfig.model_validate({"units": {"time": "ms"}}))
+        >>> log.trials[0].time.tolist()
+        [0.0, 0.01, 0.02]
+
+    Raises:
+        LogError: names file, column and row.
+    """
+    config = LogConfig() if config is None else config
+    files = [Path(path) for path in ([paths] if isinstance(paths, (str, Path)) else paths)]
+    if not files:
+        raise LogError("expected at least one file to read, found none; name a recording")
+    logs = [
+        read_trials(table, opened.config, require_force)
+        for opened in (
+            open_file(file, source, config) for file, source in zip(files, _sources(files), strict=True)
+        )
+        for table in opened.tables
+    ]
+    axes = logs[0][0]
+    for other, trials in logs:
+        if other != axes:
+            raise LogError(
+                "expected the same axes in every file, found axes that differ between files: "
+                f"{', '.join(axes)} in {logs[0][1][0].source} and {', '.join(other)} in {trials[0].source}; "
+                "set log.axes to those they have in common"
+            )
+    return InteractionLog(axes, tuple(trial for _, trials in logs for trial in trials))
+
+
+def _sources(files: Sequence[Path]) -> list[str]:
+    """File names, with as many parent folders as it takes to tell files of one name apart."""
+    resolved = [file.resolve() for file in files]
+    repeated = [file for index, file in enumerate(files) if resolved[index] in resolved[:index]]
+    if repeated:
+        raise LogError(f"{repeated[0]}: expected each file once, found it twice; name it once")
+    parts = [file.absolute().parts for file in files]
+    sources = []
+    for path in parts:
+        namesakes = [other for other in parts if other[-1:] == path[-1:]]
+        depth = 1
+        while len({other[-depth:] for other in namesakes}) < len(namesakes):
+            depth += 1
+        sources.append("/".join(path[-depth:]))
+    return sources
+
+
+def open_file(file: Path, source: str, config: LogConfig) -> Opened:
+    """A file opened as far as the names of its columns; errors call it `source`.
+
+    Raises:
+        LogError: it is missing, unreadable, or of no known format.
+    """
+    if file.is_dir():
+        raise LogError(f"{source}: expected a file, found a folder; name the recordings in it")
+    if not file.exists():
+        raise LogError(f"{source}: expected a recording, found no such file at '{file}'; check the path")
+    ending = file.suffix.lower()
+    if ending not in OPENERS:
+        *others, last = OPENERS
+        raise LogError(
+            f"{source}: expected a file that ends in {', '.join(others)} or {last}, found "
+            f"{repr(file.suffix) if ending else 'no ending'}; convert it, or rename it if it is one of these"
+        )
+    try:
+        return OPENERS[ending](file, source, config)
+    except OSError as error:
+        raise LogError(
+            f"{source}: expected a readable file, found: {brief(error)}; check the file"
+        ) from error

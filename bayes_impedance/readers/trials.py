@@ -1,0 +1,61 @@
+"""A table as trials, one for each label."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from bayes_impedance.config import LogConfig
+from bayes_impedance.errors import LogError
+from bayes_impedance.log import TRUTH_COLUMN, VECTORS, RowNumbers, Trial
+from bayes_impedance.readers.columns import axes_of, wanted_columns
+from bayes_impedance.readers.samples import Samples, read_samples
+from bayes_impedance.readers.table import Table
+
+
+def read_trials(table: Table, config: LogConfig, require_force: bool) -> tuple[tuple[str, ...], list[Trial]]:
+    """Axes of a table and its trials in SI units.
+
+    Raises:
+        LogError: names file, column and row.
+    """
+    axes = axes_of(table, config, require_force)
+    samples = read_samples(table, wanted_columns(table, config, axes, require_force), config)
+    return axes, _trials(table, samples)
+
+
+def _trials(table: Table, samples: Samples) -> list[Trial]:
+    """One trial for each label, its samples in the order of the file even where they lie apart."""
+    everything = np.full(len(samples.time), table.trial or "0", dtype=object)
+    codes, names = pd.factorize(samples.labels.get("trial", everything))
+    trials = []
+    for code, name in enumerate(names):
+        own = np.flatnonzero(codes == code)
+        groups = list(dict.fromkeys(samples.labels["group"][own])) if "group" in samples.labels else ["0"]
+        if len(groups) > 1:
+            raise LogError(
+                f"{table.source}, trial {name!r}: expected one group a trial, found {groups[0]!r} and "
+                f"{groups[1]!r}; label trials so that no two groups share one"
+            )
+        # Labels as integers: an array of objects sorts and compares slowly.
+        labelled = samples.labels.get("repetition")
+        repetition = None if labelled is None else pd.factorize(labelled[own])[0]
+        optional: dict[str, Any] = {key: samples.values[key][own] for key in VECTORS if key in samples.values}
+        if "phase" in samples.values:
+            optional["phase"] = samples.values["phase"][own, 0]
+        truth = {key: value[own, 0] for key, value in samples.values.items() if TRUTH_COLUMN.fullmatch(key)}
+        trials.append(
+            Trial(
+                name=str(name),
+                group=str(groups[0]),
+                source=table.source,
+                time=samples.time[own],
+                repetition=repetition,  # type: ignore[arg-type]
+                truth=truth,
+                rows=RowNumbers(samples.rows.word, samples.rows.numbers[own]),
+                **optional,
+            )
+        )
+    return trials
