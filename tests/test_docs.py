@@ -171,10 +171,12 @@ def test_pages_know_nothing_of_the_machine_or_the_run(reference: Reference) -> N
 
 
 def test_fields_of_the_configuration_show_what_they_allow(reference: Reference) -> None:
-    text = re.sub(r"\s+", " ", reference.page_of("bayes_impedance.config").text)
-    assert "median: float (required, > 0)" in text
-    assert "log_sd: float (> 0, ≤ 5) = 1.0" in text
-    assert "smoother: Smoother | None = Smoother()" in text
+    def page(section: str) -> str:
+        return re.sub(r"\s+", " ", reference.page_of(f"bayes_impedance.config.{section}").text)
+
+    assert "median: float (required, > 0)" in page("sections")
+    assert "log_sd: float (> 0, ≤ 5) = 1.0" in page("sections")
+    assert "smoother: Smoother | None = Smoother()" in page("preprocessing")
 
 
 def test_a_broken_reference_fails_the_build_and_writes_nothing(tmp_path: Path) -> None:
