@@ -60,6 +60,7 @@ PREPROCESSING = (
     "preprocessing.prepared",
     "preprocessing.grid",
     "preprocessing.savitzky_golay",
+    "preprocessing.bandwidth",
     "preprocessing.prepare",
     "preprocessing",
 )

@@ -30,16 +30,27 @@ class SavitzkyGolay:
     def __call__(self, values: Array, derivative: int = 0) -> Array:
         """Filtered `values (n, …)`; the first and last fits also serve the half windows at the ends."""
         half = self.length // 2
-        offsets = np.arange(-half, half + 1) / half
-        # Legendre polynomials on [−1, 1], not savgol_filter of scipy: that fits powers of sample numbers,
-        # which at order 7 costs half the digits with 101 samples and silently returns zeros with 501.
-        fit = np.linalg.pinv(legvander(offsets, self.order))
-        evaluate = legvander(offsets, self.order - derivative) @ legder(np.eye(self.order + 1), derivative)
-        evaluate = evaluate / (half * self.step) ** derivative
+        fit, evaluate = self._fit(derivative)
         smoothed: Array = correlate1d(values, evaluate[half] @ fit, axis=0, mode="constant")
         smoothed[:half] = evaluate[:half] @ (fit @ values[: self.length])
         smoothed[-half:] = evaluate[half + 1 :] @ (fit @ values[-self.length :])
         return smoothed
+
+    def coefficients(self, derivative: int = 0) -> Array:
+        """Weights of the samples of a window in the value at its middle, `(length,)` [1/s^derivative]."""
+        fit, evaluate = self._fit(derivative)
+        weights: Array = evaluate[self.length // 2] @ fit
+        return weights
+
+    def _fit(self, derivative: int) -> tuple[Array, Array]:
+        """Samples of a window → coefficients of the polynomial, and these → a derivative at each sample."""
+        half = self.length // 2
+        offsets = np.arange(-half, half + 1) / half
+        # Legendre polynomials on [−1, 1], not savgol_filter of scipy: that fits powers of sample numbers,
+        # which at order 7 costs half the digits with 101 samples and silently returns zeros with 501.
+        fit: Array = np.linalg.pinv(legvander(offsets, self.order))
+        evaluate = legvander(offsets, self.order - derivative) @ legder(np.eye(self.order + 1), derivative)
+        return fit, evaluate / (half * self.step) ** derivative
 
 
 def choose_filter(trial: Trial, smoother: Smoother, step: float) -> SavitzkyGolay:
