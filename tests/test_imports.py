@@ -65,6 +65,8 @@ PREPROCESSING = (
     "preprocessing",
 )
 
+INSPECTION = ("inspection.guess", "inspection")
+
 #: From the bottom to the top. Within a layer modules do not know each other, unless FAMILIES says so.
 LAYERS: tuple[frozenset[str], ...] = tuple(
     map(
@@ -74,7 +76,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             {*CONFIG, "outputs", "journal"},
             {"log", "evaluation.metrics"},
             {*READERS, *PREPROCESSING, "writer"},
-            {"trajectory_mean", "device"},
+            {"trajectory_mean", "device", *INSPECTION},
             {"kernels", "kernels.stationary", "kernels.derivative", "kernels.warped", "kernels.impedance"},
             {"features"},
             {"priors"},
@@ -103,6 +105,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
 
 #: Modules of a layer that import each other, in one order.
 FAMILIES = (
+    INSPECTION,
     CONFIG,
     PREPROCESSING,
     READERS,

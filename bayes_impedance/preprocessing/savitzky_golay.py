@@ -48,7 +48,7 @@ class SavitzkyGolay:
         offsets = np.arange(-half, half + 1) / half
         # Legendre polynomials on [−1, 1], not savgol_filter of scipy: that fits powers of sample numbers,
         # which at order 7 costs half the digits with 101 samples and silently returns zeros with 501.
-        fit: Array = np.linalg.pinv(legvander(offsets, self.order))
+        fit = np.asarray(np.linalg.pinv(legvander(offsets, self.order)), dtype=np.float64)
         evaluate = legvander(offsets, self.order - derivative) @ legder(np.eye(self.order + 1), derivative)
         return fit, evaluate / (half * self.step) ** derivative
 
