@@ -52,6 +52,16 @@ PREPROCESSING = (
     "preprocessing.prepare",
     "preprocessing",
 )
+RECORDING = (
+    "recording.least_squares",
+    "recording.alike",
+    "recording.wrench",
+    "recording.tool",
+    "recording.quality",
+    "recording.plausibility",
+    "recording.device_law",
+    "recording",
+)
 
 #: From the bottom to the top. Within a layer modules do not know each other, unless FAMILIES says so.
 LAYERS: tuple[frozenset[str], ...] = tuple(
@@ -61,6 +71,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             {"errors"},
             {*CONFIG, "outputs", "journal"},
             {"log", "evaluation.metrics"},
+            RECORDING,
             {"readers", "readers.table", *PREPROCESSING, "writer"},
             {"trajectory_mean", "device"},
             {"kernels", "kernels.stationary", "kernels.derivative", "kernels.warped", "kernels.impedance"},
@@ -92,6 +103,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
 #: Modules of a layer that import each other, in one order.
 FAMILIES = (
     CONFIG,
+    RECORDING,
     PREPROCESSING,
     ("readers.table", "readers"),
     ("kernels.stationary", "kernels.derivative", "kernels.warped", "kernels.impedance", "kernels"),
