@@ -10,9 +10,14 @@ import numpy.typing as npt
 from bayes_impedance.log import Array
 from bayes_impedance.recording.alike import Alike
 from bayes_impedance.recording.least_squares import fit
+from bayes_impedance.recording.plausibility import Sign
 
 #: Standard errors that a mass has to be above zero to be called determined.
 SURE = 2.0
+#: Standard errors that a damping has to be away from zero to have a sign.
+SURE_OF_SIGN = 3.0
+#: A law that explains less of the variance of force is none.
+SMALLEST_SHARE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +38,16 @@ class DeviceLaw:
     def mass_determined(self) -> npt.NDArray[np.bool_]:
         """Whether the motion accelerates enough to tell the mass of an axis from zero, `(a,)`."""
         return self.mass > SURE * self.mass_error
+
+    @property
+    def sign(self) -> Sign:
+        """What the damping says about the sign of the force: a robot does not drive itself."""
+        sure = np.abs(self.damping) > SURE_OF_SIGN * self.damping_error
+        if self.pooled < SMALLEST_SHARE or not sure.any():
+            return Sign.UNKNOWN
+        if (self.damping[sure] > 0).all():
+            return Sign.EXPECTED
+        return Sign.REVERSED if (self.damping[sure] < 0).all() else Sign.UNKNOWN
 
     def sentence(self, axis: int, name: str) -> str:
         """What was found of an axis."""

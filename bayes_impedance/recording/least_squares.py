@@ -31,7 +31,8 @@ def fit(design: Array, target: Array) -> Fit:
 
     The sandwich of Newey & West 1987, with the bandwidth L of Andrews 1991 for first-order autoregressive scores s.
     """
-    coefficients: Array = np.linalg.lstsq(design.reshape(-1, design.shape[2]), target.ravel(), rcond=None)[0]
+    solution = np.linalg.lstsq(design.reshape(-1, design.shape[2]), target.ravel(), rcond=None)[0]
+    coefficients = np.asarray(solution, dtype=np.float64)
     residual = target - design @ coefficients
     bread = np.linalg.pinv(np.einsum("nrp,nrq->pq", design, design))
     scores = np.einsum("nrp,nr->np", design, residual)

@@ -101,16 +101,14 @@ def sign_check(force: Array, velocity: Array, perturbation: Array | None = None)
     """Sign of the force from P = Σ u·v, for `force`, the robot's `perturbation (n, a)` [N] and `velocity (n, a)` [m/s].
 
     The standard error is that of u ≈ B v given the motion, P = B Σ v·v: strokes of different size are no error. A
-    person damps what the robot adds, so power that flows out of a perturbed robot proves nothing.
+    person damps what the robot adds, so a perturbed robot proves nothing here; its `DeviceLaw` does.
     """
     size = float(np.mean(np.sum(velocity**2, axis=1)))
     slope = least_squares.fit(velocity[:, :, None], force)
     power, error = size * float(slope.coefficients[0]), size * float(slope.standard_errors[0])
     sign = Sign.UNKNOWN
-    if power > SURE * error:
-        sign = Sign.EXPECTED
-    elif power < -SURE * error and (perturbation is None or not perturbation.any()):
-        sign = Sign.REVERSED
+    if abs(power) > SURE * error and (perturbation is None or not perturbation.any()):
+        sign = Sign.EXPECTED if power > 0 else Sign.REVERSED
     return SignCheck(power, error, sign)
 
 

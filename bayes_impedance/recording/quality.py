@@ -21,6 +21,8 @@ ROUNDING = 1e-9
 SMALLEST_SHARE = 0.05
 #: Parts of a recording, most of which have to show a fault that is there throughout.
 BLOCKS = 20
+#: Steps of the resolution by which a channel that was held changes next.
+CAUGHT_UP = 4
 #: Samples in a row at an extreme that make it a limit.
 SHORTEST_STOP = 3
 #: Rest: speed below this share of its 95 % quantile, for at least so long [s].
@@ -150,12 +152,16 @@ def held_samples(values: Array, channel: str) -> Held | None:
         return None
     tolerance = ROUNDING * float(np.abs(values).max())
     inside = (np.abs(values) > tolerance) & (values != values.max()) & (values != values.min())
+    repeated = _repeated(values) & inside
     # What is held is held throughout; a hand rests now and then.
-    blocks = np.array_split(_repeated(values) & inside, BLOCKS)
-    share = float(np.median([block.mean() for block in blocks]))
-    # In steps of a resolution there are few levels, which come back.
-    coarse = len(np.unique(values)) < 0.5 * (1.0 - share) * len(values)
-    return Held(channel, share) if SMALLEST_SHARE <= share < 1.0 and not coarse else None
+    share = float(np.median([block.mean() for block in np.array_split(repeated, BLOCKS)]))
+    if not SMALLEST_SHARE <= share < 1.0:
+        return None
+    # After a hold a channel catches up; a slow one of coarse resolution goes on by a step.
+    steps = np.abs(np.diff(values))
+    released = steps[1:][repeated[1:-1] & (steps[1:] > 0)]
+    step = float(steps[steps > 0].min())
+    return Held(channel, share) if len(released) and np.median(released) > CAUGHT_UP * step else None
 
 
 @dataclass(frozen=True)

@@ -72,10 +72,10 @@ class Identification:
                 f", centre of mass not determined: gravity turns by {self.variation[1]:.2f} rad about a second axis; "
                 "turn the tool about at least two axes, or give log.force.tool.center_of_mass"
             )
-        if self.explained < SMALLEST_SHARE and tool.mass > SURE * self.mass_error:
+        if self.explained < SMALLEST_SHARE:
             found += (
-                f"; weight explains only {100 * self.explained:.0f} % of the variance of force: check "
-                "log.force.rotation, and that nothing touches the tool in log.force.tool.identify"
+                f"; weight explains only {100 * self.explained:.0f} % of the variance of force: unless the tool is very "
+                "light, check log.force.rotation, and that nothing touches it in log.force.tool.identify"
             )
         return found
 
@@ -89,8 +89,8 @@ def identify_tool(
 ) -> Identification:
     """The tool from a part without contact, by least squares: (m, b_F) from force, then (m c, b_T) from torque.
 
-    `force (n, 3)` [N] and `torque (n, 3)` [Nm] in the frame of the sensor, on the sensor; `acceleration (n, 3)` [m/s²]
-    of the tool and `gravity (3,)` [m/s²] in the base frame; `rotation` from sensor to base.
+    `force (n, 3)` [N] and `torque (n, 3)` [Nm] in the frame of the sensor, on the sensor; `acceleration (n, 3)`
+    [m/s²] of the tool and `gravity (3,)` [m/s²] in the base frame; `rotation` from sensor to base.
 
     Raises:
         LogError: there are less than ten samples, the orientation hardly varies, or the mass is negative.
@@ -146,7 +146,7 @@ def without_tool(
     acceleration: Array | None = None,
     gravity: Array = GRAVITY,
 ) -> Array:
-    """`force (n, 3)` [N] of the human in the frame of the sensor: without weight, bias and, given `acceleration`, m a."""
+    """`force (n, 3)` [N] of the human in the sensor's frame: without weight, bias and, given `acceleration`, m a."""
     return force - tool.mass * _specific_force(rotation, len(force), acceleration, gravity) - tool.bias
 
 
@@ -173,7 +173,7 @@ def torque_without_tool(
 
 def _specific_force(rotation: Rotation, n: int, acceleration: Array | None, gravity: Array) -> Array:
     """γ `(n, 3)` [m/s²]."""
-    fall = np.broadcast_to(gravity, (n, 3))
+    fall = np.tile(gravity, (n, 1))
     return np.asarray(rotation.inv().apply(fall if acceleration is None else fall - acceleration))
 
 

@@ -39,6 +39,8 @@ def rotations(orientation: Array, convention: str, unit: Literal["rad", "deg"] =
             f"orientation: expected finite numbers, found others at {named_rows(bad)}; leave these samples out with "
             "log.window, or set log.columns.orientation to null"
         )
+    # A copy, for scipy does not take arrays that are read-only.
+    orientation = np.array(orientation, dtype=np.float64)
     if not quaternions:
         return Rotation.from_euler(convention, orientation, degrees=unit == "deg")
     norm = np.linalg.norm(orientation, axis=1)
@@ -53,7 +55,7 @@ def rotations(orientation: Array, convention: str, unit: Literal["rad", "deg"] =
 
 def in_base_frame(force: Array, rotation: Rotation) -> Array:
     """`force (n, 3)` [N] in the tool's frame turned into the base frame."""
-    return np.asarray(rotation.apply(force), dtype=np.float64)
+    return np.asarray(rotation.apply(np.array(force)), dtype=np.float64)
 
 
 @dataclass(frozen=True)
