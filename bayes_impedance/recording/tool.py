@@ -74,8 +74,8 @@ class Identification:
             )
         if self.explained < SMALLEST_SHARE:
             found += (
-                f"; weight explains only {100 * self.explained:.0f} % of the variance of force: unless the tool is very "
-                "light, check log.force.rotation, and that nothing touches it in log.force.tool.identify"
+                f"; weight explains only {100 * self.explained:.0f} % of the variance of force; unless the tool is "
+                "very light, check log.force.rotation, and that nothing touches it in log.force.tool.identify"
             )
         return found
 
