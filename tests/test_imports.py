@@ -64,6 +64,16 @@ PREPROCESSING = (
     "preprocessing.prepare",
     "preprocessing",
 )
+RECORDING = (
+    "recording.least_squares",
+    "recording.alike",
+    "recording.wrench",
+    "recording.tool",
+    "recording.quality",
+    "recording.plausibility",
+    "recording.device_law",
+    "recording",
+)
 
 INSPECTION = ("inspection.guess", "inspection")
 
@@ -75,6 +85,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             {"errors"},
             {*CONFIG, "outputs", "journal"},
             {"log", "evaluation.metrics"},
+            RECORDING,
             {*READERS, *PREPROCESSING, "writer"},
             {"trajectory_mean", "device", *INSPECTION},
             {"kernels", "kernels.stationary", "kernels.derivative", "kernels.warped", "kernels.impedance"},
@@ -107,6 +118,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
 FAMILIES = (
     INSPECTION,
     CONFIG,
+    RECORDING,
     PREPROCESSING,
     READERS,
     ("kernels.stationary", "kernels.derivative", "kernels.warped", "kernels.impedance", "kernels"),
