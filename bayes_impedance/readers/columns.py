@@ -47,13 +47,13 @@ def wanted_columns(
     """
     columns = config.columns
     required = {"time", "position"} | ({"force"} if require_force else set())
-    if turned(config):
+    if is_turned(config):
         required |= {"orientation"}
     wanted: dict[str, tuple[str, ...]] = {}
     for key in Columns.model_fields:
         names = _names(columns, key, _axes_of_quantity(key, config, axes))
         # Messages carry their time.
-        if names is None or (key in WRENCH and not turned(config)) or (key in TIMES and table.timed):
+        if names is None or (key in WRENCH and not is_turned(config)) or (key in TIMES and table.timed):
             continue
         absent = [name for name in names if name not in table.columns]
         # A name that the user wrote down is a name that the user expects to be there.
@@ -75,14 +75,15 @@ def wanted_columns(
     return wanted
 
 
-def turned(config: LogConfig) -> bool:
+def is_turned(config: LogConfig) -> bool:
     """Whether the force of the human takes the orientation of the tool to find."""
     return config.force.frame == "tool" or config.force.tool is not None
 
 
 def _axes_of_quantity(key: str, config: LogConfig, axes: tuple[str, ...]) -> tuple[str, ...]:
     # A vector turns as a whole, whatever axes are wanted in the end; so does the acceleration of a tool.
-    whole = turned(config) and key in ("force", "torque", "position")
+    moves = config.force.tool is not None and config.force.tool.inertia
+    whole = is_turned(config) and (key in ("force", "torque") or (moves and key == "position"))
     return AXES if whole else axes
 
 

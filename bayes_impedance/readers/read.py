@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from bayes_impedance.config import LogConfig
@@ -12,7 +12,7 @@ from bayes_impedance.readers.cells import brief
 from bayes_impedance.readers.parquet import open_parquet
 from bayes_impedance.readers.table import Opened
 from bayes_impedance.readers.text import open_text
-from bayes_impedance.readers.trials import read_trials
+from bayes_impedance.readers.trials import Reading, read_trials
 
 #: How a file of each ending opens.
 OPENERS: dict[str, Callable[[Path, str, LogConfig], Opened]] = {
@@ -41,24 +41,45 @@ def read_log(
     """
     config = LogConfig() if config is None else config
     files = [Path(path) for path in ([paths] if isinstance(paths, (str, Path)) else paths)]
+    return as_log([reading for opened in open_files(files, config) for reading in read_tables(opened, require_force)])
+
+
+def open_files(files: Sequence[Path], config: LogConfig) -> Iterator[Opened]:
+    """Each file opened as far as the names of its columns.
+
+    Raises:
+        LogError: as `open_file` does, or a file is named twice.
+    """
     if not files:
         raise LogError("expected at least one file to read, found none; name a recording")
-    logs = [
-        read_trials(table, opened.config, require_force)
-        for opened in (
-            open_file(file, source, config) for file, source in zip(files, _sources(files), strict=True)
-        )
-        for table in opened.tables
-    ]
-    axes = logs[0][0]
-    for other, trials in logs:
-        if other != axes:
+    for file, source in zip(files, _sources(files), strict=True):
+        yield open_file(file, source, config)
+
+
+def read_tables(opened: Opened, require_force: bool = True) -> list[Reading]:
+    """The recordings of a file, read.
+
+    Raises:
+        LogError: names file, column and row.
+    """
+    return [read_trials(table, opened.config, require_force) for table in opened.tables]
+
+
+def as_log(readings: Sequence[Reading]) -> InteractionLog:
+    """All trials of several recordings.
+
+    Raises:
+        LogError: their axes differ, or a trial is not a valid recording.
+    """
+    first = readings[0]
+    for other in readings:
+        if other.axes != first.axes:
             raise LogError(
                 "expected the same axes in every file, found axes that differ between files: "
-                f"{', '.join(axes)} in {logs[0][1][0].source} and {', '.join(other)} in {trials[0].source}; "
+                f"{', '.join(first.axes)} in {first.source} and {', '.join(other.axes)} in {other.source}; "
                 "set log.axes to those they have in common"
             )
-    return InteractionLog(axes, tuple(trial for _, trials in logs for trial in trials))
+    return InteractionLog(first.axes, tuple(trial for reading in readings for trial in reading.trials))
 
 
 def _sources(files: Sequence[Path]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,28 +12,43 @@ from bayes_impedance.config import LogConfig
 from bayes_impedance.errors import LogError
 from bayes_impedance.log import TRUTH_COLUMN, VECTORS, RowNumbers, Trial
 from bayes_impedance.readers.columns import axes_of, wanted_columns
+from bayes_impedance.readers.force import Preparation, prepare_force
 from bayes_impedance.readers.samples import Samples, read_samples
 from bayes_impedance.readers.table import Table
 
 
-def read_trials(table: Table, config: LogConfig, require_force: bool) -> tuple[tuple[str, ...], list[Trial]]:
-    """Axes of a table and its trials in SI units.
+@dataclass(frozen=True)
+class Reading:
+    """A table as it was read: `sensed`, its samples before force was prepared, what was found then, and its trials."""
+
+    source: str
+    axes: tuple[str, ...]
+    sensed: Samples
+    preparation: Preparation
+    trials: tuple[Trial, ...]
+
+
+def read_trials(table: Table, config: LogConfig, require_force: bool) -> Reading:
+    """The trials of a table in SI units.
 
     Raises:
         LogError: names file, column and row.
     """
     axes = axes_of(table, config, require_force)
-    samples = read_samples(table, wanted_columns(table, config, axes, require_force), config)
-    return axes, _trials(table, samples)
+    sensed = read_samples(table, wanted_columns(table, config, axes, require_force), config)
+    samples, preparation = prepare_force(sensed, config, axes, table.source)
+    return Reading(table.source, axes, sensed, preparation, tuple(_trials(table, samples, config)))
 
 
-def _trials(table: Table, samples: Samples) -> list[Trial]:
+def _trials(table: Table, samples: Samples, config: LogConfig) -> list[Trial]:
     """One trial for each label, its samples in the order of the file even where they lie apart."""
     everything = np.full(len(samples.time), table.trial or "0", dtype=object)
     codes, names = pd.factorize(samples.labels.get("trial", everything))
     trials = []
     for code, name in enumerate(names):
         own = np.flatnonzero(codes == code)
+        if config.clock.duplicates == "drop":
+            own = own[np.diff(samples.time[own], prepend=-np.inf) != 0]
         groups = list(dict.fromkeys(samples.labels["group"][own])) if "group" in samples.labels else ["0"]
         if len(groups) > 1:
             raise LogError(

@@ -1,0 +1,121 @@
+"""What looks wrong with the channels of a recording, one sentence each, and how to mend it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from bayes_impedance.errors import LogError
+from bayes_impedance.log import AXES, Array
+from bayes_impedance.readers.samples import Samples
+from bayes_impedance.readers.trials import Reading
+from bayes_impedance.recording.clock import ClockReport
+from bayes_impedance.recording.plausibility import Sign, sign_check, unit_check, velocity_mismatch
+from bayes_impedance.recording.quality import (
+    Finding,
+    dead_band,
+    force_at_rest,
+    held_samples,
+    saturation,
+)
+
+#: Samples of a recording that are looked at, from its middle: more tell nothing new.
+ENOUGH = 200_000
+
+
+def look_at(reading: Reading) -> list[str]:
+    """Findings on everything that was read of a table, as sentences.
+
+    Example:
+        >>> import pandas as pd
+        >>> from bayes_impedance.config import LogConfig
+        >>> from bayes_impedance.readers.read import open_file, read_tables
+        >>> time = np.arange(400) / 100.0
+        >>> force = np.clip(8 * np.sin(9 * time), -5, 5)
+        >>> table = pd.DataFrame({"time": time, "position_x": 0.1 * np.sin(time), "force_x": force})
+        >>> table.to_csv("log.csv", index=False)
+        >>> (reading,) = read_tables(open_file(Path("log.csv"), "log.csv", LogConfig()))
+        >>> [sentence.split(":")[0] for sentence in look_at(reading)]
+        ['force_x']
+    """
+    samples = middle_of(reading.sensed)
+    found: list[Finding] = []
+    for key in ("position", "velocity", "acceleration", "force"):
+        if key in samples.values:
+            found += _of_quantity(key, samples.values[key], reading.axes)
+    found += _of_motion(samples, reading.axes)
+    sentences = [finding.sentence for finding in found]
+    for name, clock in reading.sensed.clocks.items():
+        sentences += [f"{name}: {sentence}" for sentence in clock_sentences(clock)]
+    return [*dict.fromkeys(sentences), *_of_the_sign(reading)]
+
+
+def middle_of(samples: Samples) -> Samples:
+    """At most ENOUGH samples, from the middle."""
+    surplus = max(0, len(samples.time) - ENOUGH)
+    part = slice(surplus // 2, len(samples.time) - (surplus - surplus // 2))
+    return Samples(samples.time[part], samples.rows, {key: v[part] for key, v in samples.values.items()})
+
+
+def _of_quantity(key: str, values: Array, axes: Sequence[str]) -> Iterator[Finding]:
+    names = [f"{key}_{axis}" for axis in (axes if values.shape[1] == len(axes) else AXES)]
+    for name, channel in zip(names, values.T, strict=True):
+        checks = [saturation, held_samples] + ([dead_band] if key == "force" else [])
+        for check in checks:
+            finding = check(channel, name)
+            if finding is not None:
+                yield finding
+    if values.shape[1] > 1 and key == "velocity":
+        # Some controllers limit the speed and not its components.
+        limited = saturation(np.linalg.norm(values, axis=1), "speed")
+        if limited is not None:
+            yield limited
+    suspicion = unit_check(key, values) if key != "acceleration" else None
+    if suspicion is not None:
+        yield suspicion
+
+
+def _of_motion(samples: Samples, axes: Sequence[str]) -> Iterator[Finding]:
+    position, velocity = samples.values["position"], samples.values.get("velocity")
+    if velocity is None or position.shape[1] != velocity.shape[1]:
+        return
+    for axis, x, v in zip(axes, position.T, velocity.T, strict=True):
+        try:
+            mismatch = velocity_mismatch(samples.time, x, v, f"velocity_{axis}")
+        except LogError:
+            # Too short to tell.
+            return
+        if mismatch is not None:
+            yield mismatch
+
+
+def _of_the_sign(reading: Reading) -> Iterator[str]:
+    for trial in reading.trials[:1]:
+        if trial.force is None or trial.n_samples < 10:
+            continue
+        part = slice(0, ENOUGH)
+        velocity = trial.velocity if trial.velocity is not None else np.gradient(trial.position, trial.time, axis=0)
+        added = None if trial.perturbation is None else trial.perturbation[part]
+        check = sign_check(trial.force[part], velocity[part], added)
+        if check.sign is Sign.REVERSED:
+            yield check.sentence
+        speed = np.linalg.norm(velocity[part], axis=1)
+        for axis, force in zip(reading.axes, trial.force[part].T, strict=True):
+            rest = force_at_rest(trial.time[part], force, speed, f"force_{axis}")
+            if rest is not None:
+                yield rest.sentence
+
+
+def clock_sentences(clock: ClockReport) -> Iterator[str]:
+    """What is wrong with the time stamps of a stream."""
+    if clock.gaps:
+        start, longest = max(clock.gaps, key=lambda gap: gap[1])
+        count = f"{len(clock.gaps)} gap{'s' if len(clock.gaps) > 1 else ''}"
+        yield f"{count} in the time stamps, the longest of {longest:.3g} s at {start:.6g} s"
+    if clock.duplicates:
+        yield f"{clock.duplicates} time stamps equal to the one before; set log.clock.duplicates=drop"
+    if clock.backwards:
+        yield f"{clock.backwards} time stamps earlier than the one before"
+    if clock.source == "record":
+        yield f"times are those of arrival: {clock.why}"

@@ -1,0 +1,178 @@
+"""A recording looked at from all sides: contents, clocks, what looks wrong, the robot, smoothing, trials."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from bayes_impedance.config import ClockConfig, Config, Smoother
+from bayes_impedance.errors import BayesImpedanceError, BayesImpedanceWarning, LogError
+from bayes_impedance.inspection.findings import ENOUGH, look_at
+from bayes_impedance.log import InteractionLog, Trial
+from bayes_impedance.preprocessing import PreparedLog, prepare
+from bayes_impedance.preprocessing.bandwidth import SmootherEffect, smoother_effect
+from bayes_impedance.readers.read import as_log, open_files, read_tables
+from bayes_impedance.readers.table import Table
+from bayes_impedance.readers.trials import Reading
+from bayes_impedance.recording.clock import ClockReport, choose_clock
+from bayes_impedance.recording.device_law import DeviceLaw, fit_device_law
+from bayes_impedance.recording.lag import LagEstimate, estimate_lag
+
+#: Windows that are compared, as multiples of the one that is configured.
+WINDOWS = (0.5, 1.0, 2.0)
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What is in some recordings. Later parts are None where `refusal`, a sentence, says why they cannot be had.
+
+    `tables`: what each file holds; `readings`: what was read of it; `log` and `prepared`: what the model would see;
+    `findings`: what looks wrong; `repairs`: what reading mended on its own; `clocks` by trial or topic; `smoothing`: the
+    window that is configured beside others; `law`: the robot's virtual mass and damping; `lag` of force behind motion.
+    """
+
+    config: Config
+    tables: tuple[Table, ...]
+    readings: tuple[Reading, ...] = ()
+    log: InteractionLog | None = None
+    prepared: PreparedLog | None = None
+    findings: tuple[str, ...] = ()
+    repairs: tuple[str, ...] = ()
+    clocks: Mapping[str, ClockReport] = field(default_factory=dict)
+    smoothing: tuple[SmootherEffect, ...] = ()
+    law: DeviceLaw | None = None
+    lag: LagEstimate | None = None
+    refusal: str | None = None
+
+
+def inspect_recordings(files: Sequence[Path], config: Config) -> Inspection:
+    """Everything that can be said of some files under a configuration.
+
+    What keeps them from being read ends up in `refusal`; what keeps them from being opened is raised.
+
+    Raises:
+        LogError: a file is missing, or of no known format.
+    """
+    repairs: list[str] = []
+    with _heard(repairs):
+        opened = list(open_files(files, config.log))
+        tables = tuple(table for file in opened for table in file.tables)
+        result = Inspection(config, tables)
+        try:
+            readings = tuple(reading for file in opened for reading in read_tables(file, require_force=False))
+            result = replace(result, readings=readings)
+            log = as_log(readings)
+        except BayesImpedanceError as error:
+            return replace(result, refusal=str(error), repairs=tuple(repairs))
+    result = replace(
+        result,
+        log=log,
+        findings=tuple(dict.fromkeys(sentence for reading in readings for sentence in look_at(reading))),
+        clocks=_clocks(readings),
+        law=_law(log),
+        lag=_lag(log),
+    )
+    with _heard(repairs):
+        try:
+            result = replace(result, prepared=prepare(log, config.preprocessing))
+        except BayesImpedanceError as error:
+            result = replace(result, refusal=str(error))
+        result = replace(result, smoothing=_smoothing(log, config.preprocessing.smoother))
+    return replace(result, repairs=tuple(dict.fromkeys(repairs)))
+
+
+@contextmanager
+def _heard(repairs: list[str]) -> Iterator[None]:
+    """Our warnings as sentences in place of warnings."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", BayesImpedanceWarning)
+        try:
+            yield
+        finally:
+            for warning in caught:
+                if issubclass(warning.category, BayesImpedanceWarning):
+                    repairs.append(str(warning.message))
+    for warning in caught:
+        if not issubclass(warning.category, BayesImpedanceWarning):
+            warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
+
+
+def _clocks(readings: Sequence[Reading]) -> dict[str, ClockReport]:
+    """The time stamps of each topic, or of each trial where the log has one column of time."""
+    clocks: dict[str, ClockReport] = {}
+    for reading in readings:
+        clocks |= {f"{reading.source}, {name}": clock for name, clock in reading.sensed.clocks.items()}
+        if not reading.sensed.clocks:
+            for trial in reading.trials:
+                where = f"{reading.source}, trial {trial.name}"
+                try:
+                    clocks[where] = choose_clock(trial.time, None, ClockConfig(duplicates="drop"), where).report
+                except LogError:
+                    # Time that goes back is refused where the trial is checked.
+                    continue
+    return clocks
+
+
+def _law(log: InteractionLog) -> DeviceLaw | None:
+    """That of the longest trial."""
+    trial = max((trial for trial in log.trials if trial.force is not None), key=_length, default=None)
+    if trial is None or trial.force is None:
+        return None
+    trial = _middle(trial)
+    assert trial.force is not None
+    try:
+        return fit_device_law(
+            trial.time, trial.velocity, trial.force, trial.perturbation, position=trial.position
+        )
+    except LogError:
+        return None
+
+
+def _lag(log: InteractionLog) -> LagEstimate | None:
+    trial = max((trial for trial in log.trials if trial.force is not None), key=_length, default=None)
+    if trial is None or trial.force is None:
+        return None
+    trial = _middle(trial)
+    assert trial.force is not None
+    return estimate_lag(trial.time, trial.position, trial.force, perturbation=trial.perturbation)
+
+
+def _length(trial: Trial) -> int:
+    return trial.n_samples
+
+
+def _middle(trial: Trial) -> Trial:
+    surplus = max(0, trial.n_samples - ENOUGH)
+    part = slice(surplus // 2, trial.n_samples - (surplus - surplus // 2))
+    cut = {
+        name: value[part]
+        for name in ("time", "position", "velocity", "force", "perturbation", "repetition")
+        if (value := getattr(trial, name)) is not None
+    }
+    return replace(trial, **cut, acceleration=None, reference=None, phase=None, truth={}, rows=None)
+
+
+def _smoothing(log: InteractionLog, smoother: Smoother | None) -> tuple[SmootherEffect, ...]:
+    """The configured window and others, on the longest trial."""
+    if smoother is None:
+        return ()
+    trial = _middle(max(log.trials, key=_length))
+    effects = []
+    for factor in WINDOWS:
+        try:
+            effects.append(smoother_effect(trial, smoother.model_copy(update={"window": factor * smoother.window})))
+        except LogError:
+            # Longer than the trial.
+            continue
+    # Short windows end up as the shortest that the order allows.
+    return tuple({round(effect.window, 9): effect for effect in effects}.values())
+
+
+def durations(prepared: PreparedLog) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """Of each trial [s]."""
+    return np.array([np.ptp(trial.time) for trial in prepared.trials])
