@@ -49,6 +49,9 @@ PREPROCESSING = (
     "preprocessing.prepared",
     "preprocessing.grid",
     "preprocessing.savitzky_golay",
+    "preprocessing.segmentation",
+    "preprocessing.phase",
+    "preprocessing.warping",
     "preprocessing.prepare",
     "preprocessing",
 )
@@ -118,6 +121,7 @@ CONFINED = {
     "safetensors": {"persistence"},
     "pyarrow": {"readers.table"},
     "filelock": {"journal"},
+    "dtaidistance": {"preprocessing.warping"},
 }
 
 
