@@ -32,7 +32,7 @@ def along_path(trial: PreparedTrial, rest_speed: float) -> PreparedTrial:
         pace = np.hypot(np.linalg.norm(velocity, axis=1), rest_speed)
         phase[part] = way / way[-1]
         rate[part] = pace / way[-1]
-        change[part] = (velocity * acceleration).sum(axis=1) / (way[-1] * pace)
+        change[part] = (velocity * acceleration).sum(axis=1) / pace / way[-1]
         stuck = np.flatnonzero(np.diff(phase[part]) <= 0)
         if len(stuck):
             raise LogError(
