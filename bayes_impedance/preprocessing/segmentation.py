@@ -91,10 +91,13 @@ def _without_gaps(trial: Trial, config: PreprocessingConfig, left_out: list[str]
 
 def _without_rest(trial: Trial, wanted: Segmentation, left_out: list[str]) -> list[Trial]:
     """What lies between two rests of `trial`; with `split: none` or `return` all from the first motion to the last."""
-    speed = _speed(trial, wanted.rest_duration / 4)
-    resting = _lasting(~_above(speed, wanted.rest_speed), trial.time, wanted.rest_duration)
-    moving = _stretches(_lasting(~resting, trial.time, wanted.minimum_duration))
-    if not moving:
+    half = wanted.rest_duration / 4
+    speed = _speed(trial, half)
+    # The mean spreads motion, however sudden, over `half` at least; what is shorter is noise.
+    moving = _lasting(_above(speed, wanted.rest_speed), trial.time, half)
+    resting = _lasting(~moving, trial.time, wanted.rest_duration)
+    parts = _stretches(_lasting(~resting, trial.time, wanted.minimum_duration))
+    if not parts:
         slow, fast = np.quantile(speed, [0.5, 1.0])
         left_out.append(
             f"{place(trial)}: expected motion for at least {wanted.minimum_duration:g} s that exceeds "
@@ -103,8 +106,8 @@ def _without_rest(trial: Trial, wanted: Segmentation, left_out: list[str]) -> li
         )
         return []
     if wanted.split == "rest":
-        return list(_numbered(trial, moving))
-    return [_part(trial, slice(moving[0].start, moving[-1].stop), trial.name)]
+        return list(_numbered(trial, parts))
+    return [_part(trial, slice(parts[0].start, parts[-1].stop), trial.name)]
 
 
 def _in_rounds(trial: Trial, wanted: Segmentation) -> Trial:
