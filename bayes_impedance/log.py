@@ -122,11 +122,19 @@ class TrialSet(Generic[T]):
         Raises:
             LogError: that leaves no trial, or an index does not exist.
         """
-        chosen = chosen_trials(self.trials, which)
+        return self.with_trials(chosen_trials(self.trials, which))
+
+    def with_trials(self, trials: Sequence[T]) -> Self:
+        """Log of trials that were made of those of this one.
+
+        Raises:
+            LogError: two of them share source and name.
+        """
+        _check_names(trials)
         # Past the constructor: the trials are checked, and an axis may well rest in a part of a log.
         log = object.__new__(type(self))
         object.__setattr__(log, "axes", self.axes)
-        object.__setattr__(log, "trials", chosen)
+        object.__setattr__(log, "trials", tuple(trials))
         return log
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
@@ -265,7 +273,6 @@ def chosen_trials(trials: Sequence[T], which: Callable[[T], bool] | Sequence[int
         raise LogError(
             f"expected at least one of {len(trials)} trials to be selected, found none; widen the choice"
         )
-    _check_names(chosen)
     return chosen
 
 

@@ -248,7 +248,9 @@ class ImpedanceModel:
         return self._force_model(FeatureMap(self.config, axes))
 
     def _prepared(self, log: InteractionLog) -> PreparedLog:
-        prepared = prepare(log, self.config.preprocessing)
+        # Phase means the same in every log only if all are aligned to the repetition that the training log was.
+        reference = None if self._fit is None else self._fit.log
+        prepared = prepare(log, self.config.preprocessing, reference)
         return prepared if self.config.device is None else follow_law(prepared, self.config.device)
 
     def _force_model(self, feature_map: FeatureMap) -> ForceModel:

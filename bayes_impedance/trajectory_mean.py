@@ -101,7 +101,7 @@ def phase_derivatives(trial: PreparedTrial) -> tuple[Array, Array, Array]:
     if trial.phase is None or trial.phase_velocity is None or trial.phase_acceleration is None:
         raise LogError(
             f"{trial.source}, trial {trial.name}: expected a phase column, found none; name it in "
-            "log.columns.phase, or choose another trajectory_input"
+            "log.columns.phase, set preprocessing.phase.source to path or warping, or choose another trajectory_input"
         )
     return trial.phase, trial.phase_velocity, trial.phase_acceleration
 

@@ -216,7 +216,23 @@ def plausible_configurations(draw: Draw) -> Content:
         "window": st.sampled_from([0.02, 0.1, 0.1, 0.2, 0.2, 0.3, 30.0, 1e300, 1e-320]),
         "polynomial_order": st.integers(3, 7),
     }
+    segmentation = {
+        "trim_rest": st.booleans(),
+        "split": st.sampled_from(["none", "rest", "return"]),
+        "gaps": st.sampled_from(["refuse", "split"]),
+        "rest_speed": st.sampled_from([1e-320, 0.005, 0.1, 1e300]),
+        "rest_duration": st.sampled_from([1e-320, 0.1, 0.3, 1e300]),
+        "return_radius": st.sampled_from([1e-320, 0.02, 0.1, 1e300]),
+        "minimum_duration": st.sampled_from([1e-320, 0.1, 0.5, 1e300]),
+    }
+    phase = {
+        "source": st.sampled_from(["column", "path", "warping"]),
+        "rest_speed": st.sampled_from([1e-320, 0.002, 0.1, 1e300]),
+        "knots": st.sampled_from([1, 8, 100]),
+    }
     preprocessing = {
+        "segmentation": st.just({}) | st.fixed_dictionaries({}, optional=segmentation),
+        "phase": st.just({}) | st.fixed_dictionaries({}, optional=phase),
         "smoother": st.none() | st.fixed_dictionaries({}, optional=smoother),
         "rate": st.sampled_from([None, None, None, 5, 10, 10, 20, 1e-6, 1e-320, 1e300]),
         "max_gap": st.sampled_from([0.04, 0.5, 0.5, 1.0, 1e9, 1e300, 1e-320]),

@@ -397,7 +397,7 @@ CASES: dict[str, tuple[Callable[[Bench], Arguments], tuple[str, ...]]] = {
         without("phase"),
         (
             r"bad\.csv, trial 0: expected a phase column, found none",
-            r"name it in log\.columns\.phase, or choose another trajectory_input",
+            r"name it in log\.columns\.phase, set preprocessing\.phase\.source to path or warping, or choose another",
         ),
     ),
     "no reference": (

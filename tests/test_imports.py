@@ -52,6 +52,7 @@ READERS = (
     "readers.text",
     "readers.parquet",
     "readers.samples",
+    "readers.force",
     "readers.trials",
     "readers.read",
     "readers",
@@ -61,6 +62,9 @@ PREPROCESSING = (
     "preprocessing.grid",
     "preprocessing.savitzky_golay",
     "preprocessing.bandwidth",
+    "preprocessing.segmentation",
+    "preprocessing.phase",
+    "preprocessing.warping",
     "preprocessing.prepare",
     "preprocessing",
 )
@@ -75,7 +79,7 @@ RECORDING = (
     "recording",
 )
 
-INSPECTION = ("inspection.guess", "inspection")
+INSPECTION = ("inspection.guess", "inspection.findings", "inspection.inspect", "inspection.draft", "inspection")
 
 #: From the bottom to the top. Within a layer modules do not know each other, unless FAMILIES says so.
 LAYERS: tuple[frozenset[str], ...] = tuple(
@@ -145,6 +149,7 @@ CONFINED = {
     "safetensors": {"persistence"},
     "pyarrow": {"readers.parquet"},
     "filelock": {"journal"},
+    "dtaidistance": {"preprocessing.warping"},
 }
 
 

@@ -19,10 +19,12 @@ class Smoother(Section):
 class Segmentation(Section):
     """Where trials and repetitions begin and end, where the log has no columns that say so.
 
-    `rest` is a speed under `rest_speed` [m/s] for at least `rest_duration` [s]. `trim_rest` cuts it off both ends of
-    each trial. `split: rest` makes a trial of what lies between two rests; `split: return` makes a repetition of what
-    lies between two passages of the start, within `return_radius` [m] of it. Parts shorter than `minimum_duration` [s]
-    are left out. `gaps: split` begins a new trial behind a gap longer than `max_gap`, in place of refusing it.
+    `rest` is a speed under `rest_speed` [m/s], averaged over half of `rest_duration` [s], for at least that long; what
+    never exceeds twice `rest_speed` in between is noise. `trim_rest` cuts it off both ends of each trial. `split: rest`
+    makes a trial of what lies between two rests; `split: return` makes a repetition of what lies between two passages
+    of the start, within `return_radius` [m] of it, having left it by twice that. Parts shorter than `minimum_duration`
+    [s] are left out; a way out of the radius that is shorter is no round. `gaps: split` begins a new trial behind a gap
+    longer than `max_gap`, in place of refusing it.
     """
 
     trim_rest: bool = False

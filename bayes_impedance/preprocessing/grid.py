@@ -23,7 +23,7 @@ def place(trial: Trial | PreparedTrial) -> str:
     return f"{trial.source}, trial {trial.name!r}"
 
 
-def repetitions(trial: Trial) -> Iterator[slice]:
+def repetitions(trial: Trial | PreparedTrial) -> Iterator[slice]:
     """The samples of each repetition; they lie next to each other."""
     edges = np.flatnonzero(np.diff(trial.repetition)) + 1
     for start, end in zip([0, *edges], [*edges, trial.n_samples], strict=True):
@@ -76,7 +76,7 @@ def _phase_at(grid: Array, time: Array, phase: Array, trial: Trial) -> Array:
     return value
 
 
-def check_phase_length(n: int, start: float, trial: Trial) -> None:
+def check_phase_length(n: int, start: float, trial: Trial | PreparedTrial) -> None:
     """Refuse a repetition of `n` samples that begins at `start` [s] if it is too short for a rate of phase.
 
     Raises:

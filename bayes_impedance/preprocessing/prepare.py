@@ -1,4 +1,4 @@
-"""From raw samples to smoothed motion and force on an even grid.
+"""From raw samples to smoothed motion and force on an even grid, with phase.
 
 The same Savitzky–Golay filter acts on force and on motion: filtering one alone would bias mass, damping
 and stiffness, because u = m ẍ + d ẋ + k x + … holds between signals that saw the same filter.
@@ -17,8 +17,11 @@ from bayes_impedance.config import PreprocessingConfig
 from bayes_impedance.errors import LogError
 from bayes_impedance.log import Array, InteractionLog, Trial
 from bayes_impedance.preprocessing.grid import check_phase_length, on_even_grid, place, repetitions
+from bayes_impedance.preprocessing.phase import along_path
 from bayes_impedance.preprocessing.prepared import ARRAYS, PreparedLog, PreparedTrial
 from bayes_impedance.preprocessing.savitzky_golay import SavitzkyGolay, choose_filter
+from bayes_impedance.preprocessing.segmentation import segment
+from bayes_impedance.preprocessing.warping import align
 
 #: A channel and its first two derivatives.
 Orders = tuple[Array, Array, Array]
@@ -27,10 +30,14 @@ Orders = tuple[Array, Array, Array]
 UNEVEN = 0.01
 
 
-def prepare(log: InteractionLog, config: PreprocessingConfig) -> PreparedLog:
-    """Every trial checked for gaps, put on an even grid, smoothed, differentiated and thinned to `rate`.
+def prepare(
+    log: InteractionLog, config: PreprocessingConfig, reference: PreparedLog | None = None
+) -> PreparedLog:
+    """Every trial segmented, put on an even grid, smoothed, differentiated, given its phase and thinned to `rate`.
 
-    Warns (LogWarning) when the smoother needs a longer window.
+    With `phase.source: warping` phase is aligned to that of `reference`, an earlier log of the same configuration, or,
+    for groups that are not in it, to a repetition of `log`. Warns (LogWarning) of gaps that split a trial and of parts
+    that are left out, and when the smoother needs a longer window.
 
     Example:
         >>> time = np.arange(200) / 100.0
@@ -42,26 +49,25 @@ def prepare(log: InteractionLog, config: PreprocessingConfig) -> PreparedLog:
     Raises:
         LogError: names source and trial.
     """
-    return PreparedLog(log.axes, tuple(_prepare(trial, config) for trial in log.trials))
+    log = segment(log, config)
+    prepared = PreparedLog(log.axes, tuple(_prepare(trial, config) for trial in log.trials))
+    return align(prepared, config.phase, reference) if config.phase.source == "warping" else prepared
 
 
 def _prepare(trial: Trial, config: PreprocessingConfig) -> PreparedTrial:
     steps = np.diff(trial.time)
     step = float(np.median(steps))
-    gap = int(np.argmax(steps))
-    # Relative slack, here and below: differences of time stamps carry rounding errors.
-    if steps[gap] > config.max_gap * (1 + 1e-9):
-        raise LogError(
-            f"{place(trial)}: expected steps of at most {config.max_gap:g} s, found a gap of {steps[gap]:g} s "
-            f"from {trial.time[gap]:g} to {trial.time[gap + 1]:g} s; cut there with log.window, or raise "
-            "preprocessing.max_gap"
-        )
+    if config.phase.source != "column":
+        trial = replace(trial, phase=None)
     if config.smoother is None:
         prepared = _as_logged(trial)
     else:
+        # Relative slack, here and below: differences of time stamps carry rounding errors.
         if np.abs(steps - step).max() > UNEVEN * step * (1 + 1e-9):
             trial = on_even_grid(trial, step)
         prepared = _smoothed(trial, choose_filter(trial, config.smoother, step))
+    if config.phase.source != "column":
+        prepared = along_path(prepared, config.phase.rest_speed)
     return _thinned(prepared, step, config.rate)
 
 
