@@ -79,7 +79,13 @@ RECORDING = (
     "recording",
 )
 
-INSPECTION = ("inspection.guess", "inspection.findings", "inspection.inspect", "inspection.draft", "inspection")
+INSPECTION = (
+    "inspection.guess",
+    "inspection.findings",
+    "inspection.inspect",
+    "inspection.draft",
+    "inspection",
+)
 
 #: From the bottom to the top. Within a layer modules do not know each other, unless FAMILIES says so.
 LAYERS: tuple[frozenset[str], ...] = tuple(

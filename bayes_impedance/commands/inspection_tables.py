@@ -43,7 +43,9 @@ def _print_contents(console: Console, inspection: Inspection) -> None:
         seen.setdefault(key, []).append(table.trial or "")
     for (source, names), trials in seen.items():
         recordings = f", {len(trials)} recordings" if len(trials) > 1 else ""
-        console.print(f"[bold]{escape(source)}[/bold]{recordings}: {escape(', '.join(names))}", highlight=False)
+        console.print(
+            f"[bold]{escape(source)}[/bold]{recordings}: {escape(', '.join(names))}", highlight=False
+        )
 
 
 def compressed(names: Iterable[str]) -> list[str]:
@@ -62,7 +64,9 @@ def compressed(names: Iterable[str]) -> list[str]:
         numbered = [index for index in indices if index >= 0]
         last = f"…{max(numbered)}" if len(numbered) > 1 else ""
         topic, point, rest = name.partition(".") if name.startswith("/") else ("", "", name)
-        parts.setdefault(f"{topic}{point}", []).append(rest + (f"[{min(numbered)}{last}]" if numbered else ""))
+        parts.setdefault(f"{topic}{point}", []).append(
+            rest + (f"[{min(numbered)}{last}]" if numbered else "")
+        )
     return [
         *parts.pop("", []),
         *(prefix + (own[0] if len(own) == 1 else f"({', '.join(own)})") for prefix, own in parts.items()),
@@ -77,7 +81,9 @@ def _table(title: str, *columns: str) -> Table:
 
 
 def _clock_table(inspection: Inspection) -> Table:
-    table = _table("Time stamps", "", "samples", "span [s]", "rate [Hz]", "jitter [ms]", "gaps", "equal", "clock")
+    table = _table(
+        "Time stamps", "", "samples", "span [s]", "rate [Hz]", "jitter [ms]", "gaps", "equal", "clock"
+    )
     for name, clock in list(inspection.clocks.items())[:LONGEST_TABLE]:
         offset = clock.against_recorder
         compared = "" if offset is None else f", {offset.offset:+.3f} s, {offset.drift:+.0f} ppm"
@@ -113,7 +119,9 @@ def _quantity_table(log: InteractionLog) -> Table:
 
 
 def _trial_table(prepared: PreparedLog) -> Table:
-    table = _table("What the model would see", "trial", "group", "samples", "duration [s]", "repetitions", "phase")
+    table = _table(
+        "What the model would see", "trial", "group", "samples", "duration [s]", "repetitions", "phase"
+    )
     for trial in prepared.trials[:LONGEST_TABLE]:
         phase = "" if trial.phase is None else f"{trial.phase[0]:.3f} … {trial.phase[-1]:.3f}"
         table.add_row(
@@ -143,9 +151,7 @@ def _smoother_table(inspection: Inspection) -> Table:
             f"{effect.window:.3g}", ", ".join(f"{frequency:.3g}" for frequency in effect.bandwidth), f"{1e6 * x:.2g}",
             f"{1e3 * v:.2g}", f"{a:.2g}", f"{effect.force_noise(*medians).max():.2g}", removed, style=style,
         )  # fmt: skip
-    table.caption = (
-        "bold: preprocessing.smoother.window; the noisiest axis; force: k x + d v + m a at the priors' medians"
-    )
+    table.caption = "bold: preprocessing.smoother.window; the noisiest axis; force: k x + d v + m a at the priors' medians"
     return table
 
 
@@ -163,15 +169,17 @@ def _robot(inspection: Inspection) -> list[str]:
     lag = inspection.lag
     if lag is not None:
         sentences.append(
-            f"force lags behind motion by {1e3 * lag.lag:.1f} ± {1e3 * lag.standard_error:.1f} ms; set log.force.lag if "
-            "that is more than a sample"
+            f"force lags behind motion by {1e3 * lag.lag:.1f} ± {1e3 * lag.standard_error:.1f} ms; set log.force.lag "
+            "if that is more than a sample"
             if lag.determined
             else f"the lag between force and motion cannot be told: {lag.reason}"
         )
     return sentences
 
 
-def _print_sentences(console: Console, title: str, sentences: Iterable[str], style: str | None = None) -> None:
+def _print_sentences(
+    console: Console, title: str, sentences: Iterable[str], style: str | None = None
+) -> None:
     listed = list(sentences)
     if listed:
         console.print(title, style="bold")

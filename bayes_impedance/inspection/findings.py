@@ -95,7 +95,9 @@ def _of_the_sign(reading: Reading) -> Iterator[str]:
         if trial.force is None or trial.n_samples < 10:
             continue
         part = slice(0, ENOUGH)
-        velocity = trial.velocity if trial.velocity is not None else np.gradient(trial.position, trial.time, axis=0)
+        velocity = (
+            trial.velocity if trial.velocity is not None else np.gradient(trial.position, trial.time, axis=0)
+        )
         added = None if trial.perturbation is None else trial.perturbation[part]
         check = sign_check(trial.force[part], velocity[part], added)
         if check.sign is Sign.REVERSED:

@@ -32,8 +32,9 @@ class Inspection:
     """What is in some recordings. Later parts are None where `refusal`, a sentence, says why they cannot be had.
 
     `tables`: what each file holds; `readings`: what was read of it; `log` and `prepared`: what the model would see;
-    `findings`: what looks wrong; `repairs`: what reading mended on its own; `clocks` by trial or topic; `smoothing`: the
-    window that is configured beside others; `law`: the robot's virtual mass and damping; `lag` of force behind motion.
+    `findings`: what looks wrong; `repairs`: what reading mended on its own; `clocks` by trial or topic; `smoothing`:
+    the window that is configured beside others; `law`: the robot's virtual mass and damping; `lag` of force behind
+    motion.
     """
 
     config: Config
@@ -111,7 +112,9 @@ def _clocks(readings: Sequence[Reading]) -> dict[str, ClockReport]:
             for trial in reading.trials:
                 where = f"{reading.source}, trial {trial.name}"
                 try:
-                    clocks[where] = choose_clock(trial.time, None, ClockConfig(duplicates="drop"), where).report
+                    clocks[where] = choose_clock(
+                        trial.time, None, ClockConfig(duplicates="drop"), where
+                    ).report
                 except LogError:
                     # Time that goes back is refused where the trial is checked.
                     continue
@@ -165,7 +168,9 @@ def _smoothing(log: InteractionLog, smoother: Smoother | None) -> tuple[Smoother
     effects = []
     for factor in WINDOWS:
         try:
-            effects.append(smoother_effect(trial, smoother.model_copy(update={"window": factor * smoother.window})))
+            effects.append(
+                smoother_effect(trial, smoother.model_copy(update={"window": factor * smoother.window}))
+            )
         except LogError:
             # Longer than the trial.
             continue

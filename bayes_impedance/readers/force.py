@@ -188,4 +188,3 @@ def _stretches(time: Array) -> Iterator[slice]:
     edges = np.flatnonzero((steps <= 0) | (steps > LONGEST_STEP * typical)) + 1
     for start, end in zip([0, *edges], [*edges, len(time)], strict=True):
         yield slice(int(start), int(end))
-

@@ -41,7 +41,9 @@ def read_log(
     """
     config = LogConfig() if config is None else config
     files = [Path(path) for path in ([paths] if isinstance(paths, (str, Path)) else paths)]
-    return as_log([reading for opened in open_files(files, config) for reading in read_tables(opened, require_force)])
+    return as_log(
+        [reading for opened in open_files(files, config) for reading in read_tables(opened, require_force)]
+    )
 
 
 def open_files(files: Sequence[Path], config: LogConfig) -> Iterator[Opened]:
@@ -54,6 +56,16 @@ def open_files(files: Sequence[Path], config: LogConfig) -> Iterator[Opened]:
         raise LogError("expected at least one file to read, found none; name a recording")
     for file, source in zip(files, _sources(files), strict=True):
         yield open_file(file, source, config)
+
+
+def column_names(file: Path) -> tuple[str, ...]:
+    """Names of everything in a file, whatever a configuration calls its columns.
+
+    Raises:
+        LogError: as `open_file` does.
+    """
+    (opened,) = open_files([file], LogConfig())
+    return tuple(dict.fromkeys(name for table in opened.tables for name in table.columns))
 
 
 def read_tables(opened: Opened, require_force: bool = True) -> list[Reading]:

@@ -68,7 +68,7 @@ def read_samples(table: Table, wanted: Mapping[str, tuple[str, ...]], config: Lo
     """
     names = list(dict.fromkeys(name for columns in wanted.values() for name in columns))
     texts = {name for key in LABELS for name in wanted.get(key, ())}
-    base, *others = _parts(table, table.load(names, texts), wanted, config)
+    base, *others = _parts(table, table.load(names, texts), wanted)
     clock = None if not (table.timed or others) else _clock(table, base, wanted, config)
     time = _time(table, base.stream, base.clock, wanted, config) if clock is None else clock.time
     zero = time[0] if table.timed and len(time) else 0.0
@@ -79,9 +79,7 @@ def read_samples(table: Table, wanted: Mapping[str, tuple[str, ...]], config: Lo
     return _merged(table, _Timed(base, clock, *samples), time[inside], zero, others, wanted, config)
 
 
-def _parts(
-    table: Table, streams: Sequence[Stream], wanted: Mapping[str, tuple[str, ...]], config: LogConfig
-) -> list[_Part]:
+def _parts(table: Table, streams: Sequence[Stream], wanted: Mapping[str, tuple[str, ...]]) -> list[_Part]:
     """Quantities by stream and clock, those with position first."""
     parts: dict[tuple[int, str], list[str]] = {}
     for key, columns in wanted.items():
@@ -122,8 +120,8 @@ def _time(
     (name,) = wanted[clock]
     if name not in stream.columns:
         raise LogError(
-            f"{table.source}: expected as many values in {name!r} as in the columns that it times, found another number; "
-            f"name their time stamps in log.columns.{clock}"
+            f"{table.source}: expected as many values in {name!r} as in the columns that it times, found another "
+            f"number; name their time stamps in log.columns.{clock}"
         )
     return numbers(stream.rows, stream.columns[name], table.source, clock, name) * config.units.scale("time")
 
@@ -227,7 +225,9 @@ def _merged(
         for key, columns in values.items():
             rotation = config.force.rotation if key == "orientation" else None
             streams.append(
-                on_one_clock.Stream(f"{part.name} ({key})", clock.time, columns, rotation, clock.against_recorder)
+                on_one_clock.Stream(
+                    f"{part.name} ({key})", clock.time, columns, rotation, clock.against_recorder
+                )
             )
     # Rows of the base stand for its columns: they are taken, not interpolated.
     index = np.arange(len(time), dtype=np.float64)[:, None]

@@ -1,0 +1,189 @@
+"""The first draft of a configuration that would read a recording, for a person to check."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import yaml
+
+from bayes_impedance.config import Columns, Config, LogConfig, parse_config
+from bayes_impedance.config.log import LENGTH_UNITS, TIME_UNITS
+from bayes_impedance.errors import LogError
+from bayes_impedance.inspection.guess import (
+    guess_columns,
+    guess_length_unit,
+    guess_sampling_rate,
+    guess_time_unit,
+)
+from bayes_impedance.inspection.inspect import Inspection, inspect_recordings
+from bayes_impedance.log import AXES, Array
+from bayes_impedance.readers.columns import of_axis
+from bayes_impedance.readers.read import column_names, open_files
+from bayes_impedance.readers.table import Table
+
+#: Taken where nothing tells how far samples are apart [Hz].
+PLACEHOLDER_RATE = 100.0
+#: A law of the robot that explains less is not worth proposing.
+LEAST_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class Draft:
+    """`text`: the configuration as YAML, with what looks wrong as comments; `inspection`: what it rests on."""
+
+    text: str
+    inspection: Inspection
+
+
+def draft(files: Sequence[Path], overrides: Sequence[str] = (), known: Inspection | None = None) -> Draft:
+    """A configuration for some recordings: that of `known` where they have been inspected with one, else a guess.
+
+    Raises:
+        LogError: a file is missing, unreadable, or nothing in it looks like a position.
+        ConfigurationError: an override is none.
+    """
+    if known is not None:
+        content = known.config.model_dump(mode="json", exclude_defaults=True)
+        return Draft(_text(files, content, known, guessed=False), known)
+    log, remarks = _guessed_log(files)
+    content: dict[str, Any] = {"log": log}
+    # To look at, whatever has to be mended is mended; what of it was needed goes into the draft.
+    mended = {**log, "clock": {"duplicates": "drop"}}
+    lenient = {"log": mended, "preprocessing": {"segmentation": {"gaps": "split"}}}
+    inspection = inspect_recordings(files, parse_config(lenient, "draft", overrides))
+    _add_repairs(content, inspection)
+    return Draft(_text(files, content, inspection, guessed=True, remarks=remarks), inspection)
+
+
+# --- guesses -------------------------------------------------------------------------------------
+
+
+def _guessed_log(files: Sequence[Path]) -> tuple[dict[str, Any], list[str]]:
+    """The section `log` from names and values of the first file, and what could not be told."""
+    found = guess_columns(column_names(files[0]))
+    if "position" not in found:
+        # Opening says what there is.
+        list(open_files(files[:1], LogConfig()))
+        raise LogError(
+            f"{files[0].name}: expected names such as position_x, x or pos, found none that looks like a position; name "
+            "the columns in a configuration"
+        )
+    if "force" in found:
+        found = _relative(found)
+    columns = {
+        key: name
+        for key, name in found.items()
+        if name != Columns.model_fields[key].default
+    }
+    log: dict[str, Any] = {"columns": columns} if columns else {}
+    (opened,) = open_files(files[:1], LogConfig.model_validate({"columns": columns, **_TIMELESS}))
+    table = opened.tables[0]
+    position = _array(table, found["position"])
+    remarks = []
+    units = {"position": guess_length_unit(position)}
+    if "time" in found:
+        units["time"] = guess_time_unit(_array(table, found["time"])[:, 0])
+    elif not table.timed:
+        velocity = _array(table, found["velocity"]) if "velocity" in found else None
+        rate = None if velocity is None else guess_sampling_rate(position, velocity)
+        log["columns"] = {"time": None} | columns
+        log["sampling_rate"] = round(PLACEHOLDER_RATE if rate is None else rate, 1)
+        remarks.append(
+            "no column of time was found: log.sampling_rate is a placeholder, set it"
+            if rate is None
+            else "no column of time was found: log.sampling_rate is that at which positions and velocities agree"
+        )
+    if units["position"] != "m" and "velocity" in found:
+        units["velocity"] = f"{units['position']}/s"
+    plain = {"position": "m", "time": "s"}
+    changed = {key: unit for key, unit in units.items() if unit != plain.get(key)}
+    return log | ({"units": changed} if changed else {}), remarks
+
+
+#: Opens a file whether or not a column of time was found.
+_TIMELESS: Mapping[str, Any] = {"sampling_rate": PLACEHOLDER_RATE}
+
+
+def _relative(found: Mapping[str, str]) -> dict[str, str]:
+    """Paths of arrays as they are within a recording: without the groups that position and force share."""
+    parents = [found[key].split("/")[:-1] for key in ("position", "force")]
+    if found["position"].startswith("/"):
+        return dict(found)
+    shared = 0
+    while all(len(parent) > shared for parent in parents) and parents[0][shared] == parents[1][shared]:
+        shared += 1
+    prefix = "/".join(parents[0][:shared]) + "/" if shared else ""
+    return {key: name.removeprefix(prefix) for key, name in found.items() if name.startswith(prefix)}
+
+
+def _array(table: Table, template: str) -> Array:
+    """Numbers of the columns that a template names, `(n, c)`; what is none is NaN."""
+    names = [name for axis in AXES if (name := of_axis(template, axis)) in table.columns]
+    names = list(dict.fromkeys(names))
+    series = {name: column for stream in table.load(names, ()) for name, column in stream.columns.items()}
+    numbers = [pd.to_numeric(series[name], errors="coerce").to_numpy(dtype=np.float64) for name in names]
+    together = np.stack(numbers, axis=1)
+    known: Array = together[np.isfinite(together).all(axis=1)]
+    return known
+
+
+def _add_repairs(content: dict[str, Any], inspection: Inspection) -> None:
+    """What had to be mended, and the way in which trials are best compared."""
+    log = content["log"]
+    if any(clock.duplicates for clock in inspection.clocks.values()):
+        log["clock"] = {"duplicates": "drop"}
+    preprocessing: dict[str, Any] = {}
+    longest = inspection.config.preprocessing.max_gap
+    if any(length > longest for clock in inspection.clocks.values() for _, length in clock.gaps):
+        preprocessing["segmentation"] = {"gaps": "split"}
+    several = inspection.prepared is not None and sum(
+        len(np.unique(trial.repetition)) for trial in inspection.prepared.trials
+    ) > 1  # fmt: skip
+    content["extends"] = "phase" if several else "time"
+    phased = inspection.log is not None and all(trial.phase is not None for trial in inspection.log.trials)
+    if several and not phased:
+        preprocessing["phase"] = {"source": "path"}
+        preprocessing["segmentation"] = {"trim_rest": True} | preprocessing.get("segmentation", {})
+    if preprocessing:
+        content["preprocessing"] = preprocessing
+
+
+# --- text ----------------------------------------------------------------------------------------
+
+
+def _text(
+    files: Sequence[Path],
+    content: Mapping[str, Any],
+    inspection: Inspection,
+    guessed: bool,
+    remarks: Sequence[str] = (),
+) -> str:
+    doubt = "Names and units are guesses: check them." if guessed else "As the recording was read."
+    lines = [f"Draft by bayes-impedance inspect, for {', '.join(file.name for file in files[:3])}. {doubt}"]
+    listed = [*remarks, *inspection.repairs, *inspection.findings]
+    lines += ["", "What looks wrong:", *(f"- {sentence}" for sentence in listed)] if listed else []
+    head = "\n".join(f"# {line}".rstrip() for line in lines)
+    ordered = {key: content[key] for key in ("extends", "log", "preprocessing") if key in content}
+    ordered |= {key: value for key, value in content.items() if key not in ordered}
+    body = yaml.safe_dump(ordered, sort_keys=False, allow_unicode=True) if ordered else "{}\n"
+    return f"{head}\n\n{body}{_device(inspection)}"
+
+
+def _device(inspection: Inspection) -> str:
+    """The robot's law as a comment: to switch it on is for a person to decide."""
+    law, log = inspection.law, inspection.log
+    if law is None or log is None or inspection.config.device is not None:
+        return ""
+    if law.pooled < LEAST_SHARE or not law.mass_determined.all():
+        return ""
+    mass = ", ".join(f"{axis}: {value:.3g}" for axis, value in zip(log.axes, law.mass, strict=True))
+    damping = ", ".join(f"{axis}: {value:.3g}" for axis, value in zip(log.axes, law.damping, strict=True))
+    return (
+        f"\n# The robot seems to answer force (the law explains {law.pooled:.0%} of it); if it does, by design:\n"
+        f"# device: {{mass: {{{mass}}}, damping: {{{damping}}}}}\n"
+    )
