@@ -181,7 +181,9 @@ def _over_time(
 def plot_recording(log: InteractionLog, prepared: PreparedLog | None) -> Figure:
     """Position, force and speed over time as logged, what the model sees of them on top, and the path."""
     figure = Figure(figsize=(11.0, 7.5), layout="constrained")
-    panels = figure.subplot_mosaic([["position", "path"], ["force", "path"], ["speed", "phase"]], width_ratios=[2, 1])
+    panels = figure.subplot_mosaic(
+        [["position", "path"], ["force", "path"], ["speed", "phase"]], width_ratios=[2, 1]
+    )
     start = 0.0
     for trial in log.trials:
         _draw_trial(panels, trial, log.axes, start)
@@ -197,7 +199,9 @@ def plot_recording(log: InteractionLog, prepared: PreparedLog | None) -> Figure:
         panels["path"].set_aspect("equal", adjustable="datalim")
     handles = [
         Line2D([], [], color=colour, label=label)
-        for colour, label in zip((*AXIS_COLOURS[: len(log.axes)], POSTERIOR), (*log.axes, "the model sees"), strict=True)
+        for colour, label in zip(
+            (*AXIS_COLOURS[: len(log.axes)], POSTERIOR), (*log.axes, "the model sees"), strict=True
+        )
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=8, frameon=False)
     figure.suptitle(", ".join(dict.fromkeys(trial.source for trial in log.trials)), fontsize=11)
@@ -227,7 +231,9 @@ def _draw_seen(panels: dict[str, Axes], trial: PreparedTrial, time: Array) -> No
         return
     for label in np.unique(trial.repetition):
         part = trial.repetition == label
-        panels["phase"].plot(trial.time[part] - trial.time[part][0], trial.phase[part], color=POSTERIOR, lw=0.8)
+        panels["phase"].plot(
+            trial.time[part] - trial.time[part][0], trial.phase[part], color=POSTERIOR, lw=0.8
+        )
 
 
 def _chosen(posterior: Posterior, trials: Sequence[int] | None) -> list[int]:

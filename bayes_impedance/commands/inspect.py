@@ -40,7 +40,9 @@ def inspect_command(
     ] = None,
     write_config: Annotated[
         Path | None,
-        typer.Option(help="Write the configuration that would read them: a draft to check.", show_default=False),
+        typer.Option(
+            help="Write the configuration that would read them: a draft to check.", show_default=False
+        ),
     ] = None,
     figure: Annotated[
         Path | None, typer.Option(help="Draw the recording to this PNG.", show_default=False)
@@ -65,7 +67,9 @@ def inspect_command(
         text = draft(logs, overrides or [], inspection).text if text is None else text
         with whole_file(write_config) as temporary:
             temporary.write_text(text, encoding="utf-8")
-        console.print(f"wrote {write_config}; check it, then: --config {write_config}", highlight=False, soft_wrap=True)
+        console.print(
+            f"wrote {write_config}; check it, then: --config {write_config}", highlight=False, soft_wrap=True
+        )
     if figure is not None and inspection.log is not None:
         save_figure(plot_recording(inspection.log, inspection.prepared), figure)
         console.print(f"wrote {figure}", highlight=False, soft_wrap=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from rich.console import Console
@@ -13,9 +13,12 @@ from rich.table import Table
 from bayes_impedance.inspection.inspect import Inspection
 from bayes_impedance.log import InteractionLog
 from bayes_impedance.preprocessing import PreparedLog
+from bayes_impedance.recording.device_law import DeviceLaw
 
 #: Trials and topics beyond this many are counted and not listed.
 LONGEST_TABLE = 12
+#: Of the variance of force that a robot's law explains where it has one.
+LEAST_SHARE = 0.5
 
 
 def print_inspection(console: Console, inspection: Inspection) -> None:
@@ -29,7 +32,9 @@ def print_inspection(console: Console, inspection: Inspection) -> None:
         console.print(_trial_table(inspection.prepared))
     if inspection.smoothing:
         console.print(_smoother_table(inspection))
-    _print_sentences(console, "The robot", _robot(inspection))
+    if inspection.law is not None and inspection.log is not None:
+        console.print(_law_table(inspection.law, inspection.log.axes))
+    _print_sentences(console, "Force", _of_force(inspection))
     _print_sentences(console, "Mended on reading", inspection.repairs, "yellow")
     _print_sentences(console, "What looks wrong", inspection.findings, "yellow")
     if inspection.log is not None and not inspection.findings:
@@ -151,21 +156,30 @@ def _smoother_table(inspection: Inspection) -> Table:
             f"{effect.window:.3g}", ", ".join(f"{frequency:.3g}" for frequency in effect.bandwidth), f"{1e6 * x:.2g}",
             f"{1e3 * v:.2g}", f"{a:.2g}", f"{effect.force_noise(*medians).max():.2g}", removed, style=style,
         )  # fmt: skip
-    table.caption = "bold: preprocessing.smoother.window; the noisiest axis; force: k x + d v + m a at the priors' medians"
+    table.caption = "bold: as configured; of the noisiest axis; force: k x + d v + m a at the priors' medians"
     return table
 
 
-def _robot(inspection: Inspection) -> list[str]:
-    sentences = []
-    if inspection.law is not None and inspection.log is not None:
-        sentences += [inspection.law.sentence(a, axis) for a, axis in enumerate(inspection.log.axes)]
-        sentences.append(
-            f"mass and damping explain {max(inspection.law.pooled, 0.0):.0%} of the variance of force over all axes"
-            + ("" if inspection.law.pooled >= 0.5 else ": this robot does not answer force by such a law")
+def _law_table(law: DeviceLaw, axes: Sequence[str]) -> Table:
+    """Virtual mass and damping of the robot, an axis a row."""
+    table = _table("The robot's law, u + p = M a + B v", "axis", "M [kg]", "B [Ns/m]", "R²")
+    for a, axis in enumerate(axes):
+        mass = f"{law.mass[a]:.3g} ± {law.mass_error[a]:.2g}" if law.mass_determined[a] else "not determined"
+        table.add_row(
+            axis, mass, f"{law.damping[a]:.4g} ± {law.damping_error[a]:.2g}", f"{law.r_squared[a]:.2f}"
         )
-    for reading in inspection.readings:
-        if reading.preparation.tool is not None:
-            sentences.append(f"{reading.source}: {reading.preparation.tool.sentence}")
+    answers = "" if law.pooled >= LEAST_SHARE else ": this robot does not answer force by such a law"
+    table.caption = f"R² over all axes: {law.pooled:.3f}{answers}"
+    return table
+
+
+def _of_force(inspection: Inspection) -> list[str]:
+    """The tool and the lag."""
+    sentences = [
+        f"{reading.source}: {reading.preparation.tool.sentence}"
+        for reading in inspection.readings
+        if reading.preparation.tool is not None
+    ]
     lag = inspection.lag
     if lag is not None:
         sentences.append(

@@ -11,8 +11,7 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from bayes_impedance.config import Columns, Config, LogConfig, parse_config
-from bayes_impedance.config.log import LENGTH_UNITS, TIME_UNITS
+from bayes_impedance.config import Columns, LogConfig, parse_config
 from bayes_impedance.errors import LogError
 from bayes_impedance.inspection.guess import (
     guess_columns,
@@ -48,14 +47,16 @@ def draft(files: Sequence[Path], overrides: Sequence[str] = (), known: Inspectio
         ConfigurationError: an override is none.
     """
     if known is not None:
-        content = known.config.model_dump(mode="json", exclude_defaults=True)
-        return Draft(_text(files, content, known, guessed=False), known)
+        stated = known.config.model_dump(mode="json", exclude_defaults=True)
+        return Draft(_text(files, stated, known, guessed=False), known)
     log, remarks = _guessed_log(files)
     content: dict[str, Any] = {"log": log}
     # To look at, whatever has to be mended is mended; what of it was needed goes into the draft.
     mended = {**log, "clock": {"duplicates": "drop"}}
     lenient = {"log": mended, "preprocessing": {"segmentation": {"gaps": "split"}}}
     inspection = inspect_recordings(files, parse_config(lenient, "draft", overrides))
+    if any("times the derivative of position" in sentence for sentence in inspection.findings):
+        pass
     _add_repairs(content, inspection)
     return Draft(_text(files, content, inspection, guessed=True, remarks=remarks), inspection)
 
@@ -70,16 +71,12 @@ def _guessed_log(files: Sequence[Path]) -> tuple[dict[str, Any], list[str]]:
         # Opening says what there is.
         list(open_files(files[:1], LogConfig()))
         raise LogError(
-            f"{files[0].name}: expected names such as position_x, x or pos, found none that looks like a position; name "
-            "the columns in a configuration"
+            f"{files[0].name}: expected names such as position_x, x or pos, found none that looks like a position; "
+            "name the columns in a configuration"
         )
     if "force" in found:
         found = _relative(found)
-    columns = {
-        key: name
-        for key, name in found.items()
-        if name != Columns.model_fields[key].default
-    }
+    columns = {key: name for key, name in found.items() if name != Columns.model_fields[key].default}
     log: dict[str, Any] = {"columns": columns} if columns else {}
     (opened,) = open_files(files[:1], LogConfig.model_validate({"columns": columns, **_TIMELESS}))
     table = opened.tables[0]

@@ -8,8 +8,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
-
 from bayes_impedance.config import ClockConfig, Config, Smoother
 from bayes_impedance.errors import BayesImpedanceError, BayesImpedanceWarning, LogError
 from bayes_impedance.inspection.findings import ENOUGH, look_at
@@ -83,6 +81,8 @@ def inspect_recordings(files: Sequence[Path], config: Config) -> Inspection:
             result = replace(result, prepared=prepare(log, config.preprocessing))
         except BayesImpedanceError as error:
             result = replace(result, refusal=str(error))
+    # Of other windows nobody asked: what is said of them is not to be heard.
+    with _heard([]):
         result = replace(result, smoothing=_smoothing(log, config.preprocessing.smoother))
     return replace(result, repairs=tuple(dict.fromkeys(repairs)))
 
@@ -177,7 +177,3 @@ def _smoothing(log: InteractionLog, smoother: Smoother | None) -> tuple[Smoother
     # Short windows end up as the shortest that the order allows.
     return tuple({round(effect.window, 9): effect for effect in effects}.values())
 
-
-def durations(prepared: PreparedLog) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Of each trial [s]."""
-    return np.array([np.ptp(trial.time) for trial in prepared.trials])
