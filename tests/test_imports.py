@@ -53,6 +53,15 @@ PREPROCESSING = (
     "preprocessing",
 )
 
+RECORDING = (
+    "recording.offset",
+    "recording.clock",
+    "recording.synchronise",
+    "recording.spectra",
+    "recording.lag",
+    "recording",
+)
+
 #: From the bottom to the top. Within a layer modules do not know each other, unless FAMILIES says so.
 LAYERS: tuple[frozenset[str], ...] = tuple(
     map(
@@ -61,6 +70,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             {"errors"},
             {*CONFIG, "outputs", "journal"},
             {"log", "evaluation.metrics"},
+            {*RECORDING},
             {"readers", "readers.table", *PREPROCESSING, "writer"},
             {"trajectory_mean", "device"},
             {"kernels", "kernels.stationary", "kernels.derivative", "kernels.warped", "kernels.impedance"},
@@ -92,6 +102,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
 #: Modules of a layer that import each other, in one order.
 FAMILIES = (
     CONFIG,
+    RECORDING,
     PREPROCESSING,
     ("readers.table", "readers"),
     ("kernels.stationary", "kernels.derivative", "kernels.warped", "kernels.impedance", "kernels"),
