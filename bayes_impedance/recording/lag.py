@@ -123,7 +123,8 @@ def _of_band(spectra: CrossSpectra, shift: float) -> LagEstimate:
         profile = _Profile(total, spectra.omega, weights, spectra.axes)
         lag = _best(profile, shift)
         left, whole = profile.spectrum(lag)
-        explained = 1.0 - float((weights * left).sum() / (weights * whole).sum())
+        power = float((weights * whole).sum())
+        explained = 1.0 - float((weights * left).sum()) / power if power > 0 else 0.0
         # Where motion is noise, its coefficients add noise; to count that would make a lag with less damping look best.
         held = np.maximum(1.0 - left * _inverse(whole), 0.0)
         weights = uniform_filter1d(held, 5, axis=1) * _inverse(uniform_filter1d(left, 5, axis=1))

@@ -101,8 +101,8 @@ def _channels(part: Array, step: float, shift: int, axes: int) -> Array:
     force = part[max(shift, 0) :, :axes][:n]
     others = part[max(-shift, 0) :, axes:][:n]
 
-    # Not Savitzky–Golay: its orders differ in their frequency response, and a response of velocity that falls off
-    # otherwise than that of acceleration looks like a lag. The derivatives of one Gaussian are consistent.
+    # Not Savitzky–Golay: the frequency responses of its derivatives fall off differently, which at .1 s looks like a
+    # lag of up to .1 ms. The derivatives of one Gaussian are consistent, and no window has to be chosen.
     def filtered(values: Array, order: int = 0) -> Array:
         smooth: Array = gaussian_filter1d(values, SIGMA, axis=0, order=order, radius=REACH) / step**order
         return smooth[REACH:-REACH]

@@ -9,9 +9,13 @@ import numpy as np
 import pytest
 from bags import Array, states
 from scipy.interpolate import make_interp_spline
+from test_clock import delays
 
+from bayes_impedance.config.log import ClockConfig
+from bayes_impedance.recording.clock import choose_clock
 from bayes_impedance.recording.lag import LARGEST, LagEstimate, estimate_lag, remove_lag
 from bayes_impedance.recording.spectra import WINDOW, cross_spectra, turned
+from bayes_impedance.recording.synchronise import Stream, synchronise
 from bayes_impedance.simulation.arm import arm_with
 from bayes_impedance.simulation.device import BandLimitedForce, Perturbation, Unperturbed
 from bayes_impedance.simulation.experiment import Experiment, simulate
@@ -79,6 +83,29 @@ def test_lag_at_200_hz_where_nobody_logged_the_perturbation_takes_some_minutes(s
     assert not short.determined
     assert short.reason.startswith("other lags explain force about as well: standard error")
     assert abs(short.lag - lag) < 3 * short.standard_error
+
+
+def test_lag_behind_two_clocks_that_differ() -> None:
+    # Motion at 200 Hz by one sender; force at 1 kHz, 12 ms late, by another that is .37 s and 200 ppm off.
+    time, position, force, perturbation = recorded(0, 1000.0, 0.012)
+    generator = np.random.default_rng(0)
+    streams = []
+    for name, every, columns, offset, drift in (
+        ("motion", 5, np.hstack([position, perturbation]), 0.0, 0.0),
+        ("force", 1, force, 0.37, 200e-6),
+    ):
+        true = 50.0 + time[::every]
+        received = true + delays(len(true), 1e-3 * every, generator)
+        clock = choose_clock(true + offset + drift * time[::every], received, ClockConfig())
+        streams.append(Stream(name, clock.time, columns[::every], against_recorder=clock.against_recorder))
+    result = synchronise(streams[0], streams[1:])
+    motion, late = result.columns["motion"], result.columns["force"]
+    estimate = estimate_lag(result.time, motion[:, :2], late, perturbation=motion[:, 2:])
+    assert estimate.determined and estimate.lag == pytest.approx(0.012, abs=0.7e-3)
+    repaired, remain = remove_lag(result.time, late, 0.012)
+    truth = simulated(0, 1)[0][2][::5][result.rows[remain]]
+    # The sensor's noise of .05 N is averaged in one and not in the other.
+    assert np.sqrt(np.mean((repaired - truth) ** 2)) < 0.06
 
 
 def test_the_robot_alone_tells_it_at_1_khz() -> None:
@@ -204,6 +231,12 @@ def test_slow_samples_tell_nothing() -> None:
     generator = np.random.default_rng(0)
     log = [column[::80] for column in driven(generator.uniform(0.1, 1, 40), 0.012, 0.1, generator)]
     assert estimate_lag(*log).reason == "expected samples at 5 Hz or more, found 2.5 Hz"
+
+
+def test_force_that_is_zero_throughout_tells_nothing() -> None:
+    generator = np.random.default_rng(0)
+    time, position, force = driven(generator.uniform(1, 8, 40), 0.012, 0.0, generator)
+    assert not estimate_lag(time, position, 0.0 * force).determined
 
 
 @pytest.mark.parametrize("known", [0, 1])
