@@ -76,6 +76,11 @@ RECORDING = (
     "recording.quality",
     "recording.plausibility",
     "recording.device_law",
+    "recording.offset",
+    "recording.clock",
+    "recording.synchronise",
+    "recording.spectra",
+    "recording.lag",
     "recording",
 )
 
@@ -85,6 +90,15 @@ INSPECTION = (
     "inspection.inspect",
     "inspection.draft",
     "inspection",
+)
+
+
+COMMANDS = (
+    "commands.inspection_tables",
+    "commands.inspect",
+    "commands.simulate",
+    "commands.plan",
+    "commands",
 )
 
 #: From the bottom to the top. Within a layer modules do not know each other, unless FAMILIES says so.
@@ -117,7 +131,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             {"__init__"},
             SIMULATION,
             {"plotting", "terminal"},
-            {"demo", "commands", "commands.simulate", "commands.plan"},
+            {"demo", *COMMANDS},
             {"cli"},
             {"__main__"},
         ),
@@ -135,19 +149,19 @@ FAMILIES = (
     ("engines.dense", "engines.closed_loop", "engines.pointwise", "engines"),
     BASELINES,
     SIMULATION,
-    ("commands.simulate", "commands.plan", "commands"),
+    COMMANDS,
 )
 
 #: Only the command line and its demo show, draw or simulate anything.
-PRESENTATION = {"cli", "commands.simulate", "commands.plan", "demo", "terminal", "plotting", *SIMULATION}
+PRESENTATION = {"cli", *COMMANDS, "demo", "terminal", "plotting", *SIMULATION}
 
 #: What a kernel may know of this package: other kernels. They are to be taken into other people's code.
 FREE = ("kernels.", "evaluation.metrics", "errors")
 
 #: Libraries that only some layers may load, for they are slow or have no place elsewhere.
 CONFINED = {
-    "typer": {"cli", "commands.simulate", "commands.plan"},
-    "rich": {"cli", "commands.simulate", "commands.plan", "terminal"},
+    "typer": {"cli", "commands.inspect", "commands.simulate", "commands.plan"},
+    "rich": {"cli", "terminal", *COMMANDS} - {"commands"},
     "numba": {"simulation.dynamics"},
     "matplotlib": {"plotting"},
     "pydantic": set(CONFIG) - {"config"},

@@ -36,7 +36,8 @@ def print_inspection(console: Console, inspection: Inspection) -> None:
         console.print(_law_table(inspection.law, inspection.log.axes))
     _print_sentences(console, "Force", _of_force(inspection))
     _print_sentences(console, "Mended on reading", inspection.repairs, "yellow")
-    _print_sentences(console, "What looks wrong", inspection.findings, "yellow")
+    wrong = [finding.sentence for finding in inspection.findings]
+    _print_sentences(console, "What looks wrong", wrong, "yellow")
     if inspection.log is not None and not inspection.findings:
         console.print("Nothing looks wrong.", style="green")
 

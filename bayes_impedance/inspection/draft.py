@@ -24,6 +24,7 @@ from bayes_impedance.log import AXES, Array
 from bayes_impedance.readers.columns import of_axis
 from bayes_impedance.readers.read import column_names, open_files
 from bayes_impedance.readers.table import Table
+from bayes_impedance.recording.plausibility import VelocityMismatch, VelocityUnrelated
 
 #: Taken where nothing tells how far samples are apart [Hz].
 PLACEHOLDER_RATE = 100.0
@@ -55,8 +56,6 @@ def draft(files: Sequence[Path], overrides: Sequence[str] = (), known: Inspectio
     mended = {**log, "clock": {"duplicates": "drop"}}
     lenient = {"log": mended, "preprocessing": {"segmentation": {"gaps": "split"}}}
     inspection = inspect_recordings(files, parse_config(lenient, "draft", overrides))
-    if any("times the derivative of position" in sentence for sentence in inspection.findings):
-        pass
     _add_repairs(content, inspection)
     return Draft(_text(files, content, inspection, guessed=True, remarks=remarks), inspection)
 
@@ -134,6 +133,8 @@ def _add_repairs(content: dict[str, Any], inspection: Inspection) -> None:
     log = content["log"]
     if any(clock.duplicates for clock in inspection.clocks.values()):
         log["clock"] = {"duplicates": "drop"}
+    if any(isinstance(finding, (VelocityMismatch, VelocityUnrelated)) for finding in inspection.findings):
+        log["columns"] = {**log.get("columns", {}), "velocity": None}
     preprocessing: dict[str, Any] = {}
     longest = inspection.config.preprocessing.max_gap
     if any(length > longest for clock in inspection.clocks.values() for _, length in clock.gaps):
@@ -162,7 +163,7 @@ def _text(
 ) -> str:
     doubt = "Names and units are guesses: check them." if guessed else "As the recording was read."
     lines = [f"Draft by bayes-impedance inspect, for {', '.join(file.name for file in files[:3])}. {doubt}"]
-    listed = [*remarks, *inspection.repairs, *inspection.findings]
+    listed = [*remarks, *inspection.repairs, *(finding.sentence for finding in inspection.findings)]
     lines += ["", "What looks wrong:", *(f"- {sentence}" for sentence in listed)] if listed else []
     head = "\n".join(f"# {line}".rstrip() for line in lines)
     ordered = {key: content[key] for key in ("extends", "log", "preprocessing") if key in content}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,11 +25,19 @@ from bayes_impedance.recording.quality import (
 ENOUGH = 200_000
 
 
-def look_at(reading: Reading) -> list[str]:
-    """Findings on everything that was read of a table, as sentences.
+@dataclass(frozen=True)
+class TimeStamps:
+    """What is wrong with the time stamps of a stream."""
+
+    sentence: str
+
+
+def look_at(reading: Reading) -> list[Finding]:
+    """Findings on everything that was read of a table.
 
     Example:
         >>> import pandas as pd
+        >>> from pathlib import Path
         >>> from bayes_impedance.config import LogConfig
         >>> from bayes_impedance.readers.read import open_file, read_tables
         >>> time = np.arange(400) / 100.0
@@ -36,7 +45,7 @@ def look_at(reading: Reading) -> list[str]:
         >>> table = pd.DataFrame({"time": time, "position_x": 0.1 * np.sin(time), "force_x": force})
         >>> table.to_csv("log.csv", index=False)
         >>> (reading,) = read_tables(open_file(Path("log.csv"), "log.csv", LogConfig()))
-        >>> [sentence.split(":")[0] for sentence in look_at(reading)]
+        >>> [finding.sentence.split(":")[0] for finding in look_at(reading)]
         ['force_x']
     """
     samples = middle_of(reading.sensed)
@@ -45,10 +54,8 @@ def look_at(reading: Reading) -> list[str]:
         if key in samples.values:
             found += _of_quantity(key, samples.values[key], reading.axes)
     found += _of_motion(samples, reading.axes)
-    sentences = [finding.sentence for finding in found]
-    for name, clock in reading.sensed.clocks.items():
-        sentences += [f"{name}: {sentence}" for sentence in clock_sentences(clock)]
-    return [*dict.fromkeys(sentences), *_of_the_sign(reading)]
+    found += _of_trial(reading)
+    return found
 
 
 def middle_of(samples: Samples) -> Samples:
@@ -90,7 +97,8 @@ def _of_motion(samples: Samples, axes: Sequence[str]) -> Iterator[Finding]:
             yield mismatch
 
 
-def _of_the_sign(reading: Reading) -> Iterator[str]:
+def _of_trial(reading: Reading) -> Iterator[Finding]:
+    """Sign of the force, and force at rest, in the first trial."""
     for trial in reading.trials[:1]:
         if trial.force is None or trial.n_samples < 10:
             continue
@@ -101,23 +109,27 @@ def _of_the_sign(reading: Reading) -> Iterator[str]:
         added = None if trial.perturbation is None else trial.perturbation[part]
         check = sign_check(trial.force[part], velocity[part], added)
         if check.sign is Sign.REVERSED:
-            yield check.sentence
+            yield check
         speed = np.linalg.norm(velocity[part], axis=1)
         for axis, force in zip(reading.axes, trial.force[part].T, strict=True):
             rest = force_at_rest(trial.time[part], force, speed, f"force_{axis}")
             if rest is not None:
-                yield rest.sentence
+                yield rest
 
 
-def clock_sentences(clock: ClockReport) -> Iterator[str]:
-    """What is wrong with the time stamps of a stream."""
+def of_clock(name: str, clock: ClockReport) -> Iterator[Finding]:
+    """What is wrong with the time stamps of a stream or trial."""
     if clock.gaps:
         start, longest = max(clock.gaps, key=lambda gap: gap[1])
         count = f"{len(clock.gaps)} gap{'s' if len(clock.gaps) > 1 else ''}"
-        yield f"{count} in the time stamps, the longest of {longest:.3g} s at {start:.6g} s"
+        yield TimeStamps(
+            f"{name}: {count} in the time stamps, the longest of {longest:.3g} s at {start:.6g} s"
+        )
     if clock.duplicates:
-        yield f"{clock.duplicates} time stamps equal to the one before; set log.clock.duplicates=drop"
+        yield TimeStamps(
+            f"{name}: {clock.duplicates} time stamps equal to the one before; set log.clock.duplicates=drop"
+        )
     if clock.backwards:
-        yield f"{clock.backwards} time stamps earlier than the one before"
+        yield TimeStamps(f"{name}: {clock.backwards} time stamps earlier than the one before")
     if clock.source == "record":
-        yield f"times are those of arrival: {clock.why}"
+        yield TimeStamps(f"{name}: times are those of arrival, for {clock.why}")

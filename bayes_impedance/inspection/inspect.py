@@ -10,7 +10,7 @@ from pathlib import Path
 
 from bayes_impedance.config import ClockConfig, Config, Smoother
 from bayes_impedance.errors import BayesImpedanceError, BayesImpedanceWarning, LogError
-from bayes_impedance.inspection.findings import ENOUGH, look_at
+from bayes_impedance.inspection.findings import ENOUGH, look_at, of_clock
 from bayes_impedance.log import InteractionLog, Trial
 from bayes_impedance.preprocessing import PreparedLog, prepare
 from bayes_impedance.preprocessing.bandwidth import SmootherEffect, smoother_effect
@@ -20,6 +20,7 @@ from bayes_impedance.readers.trials import Reading
 from bayes_impedance.recording.clock import ClockReport, choose_clock
 from bayes_impedance.recording.device_law import DeviceLaw, fit_device_law
 from bayes_impedance.recording.lag import LagEstimate, estimate_lag
+from bayes_impedance.recording.quality import Finding
 
 #: Windows that are compared, as multiples of the one that is configured.
 WINDOWS = (0.5, 1.0, 2.0)
@@ -40,7 +41,7 @@ class Inspection:
     readings: tuple[Reading, ...] = ()
     log: InteractionLog | None = None
     prepared: PreparedLog | None = None
-    findings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     repairs: tuple[str, ...] = ()
     clocks: Mapping[str, ClockReport] = field(default_factory=dict)
     smoothing: tuple[SmootherEffect, ...] = ()
@@ -68,11 +69,14 @@ def inspect_recordings(files: Sequence[Path], config: Config) -> Inspection:
             log = as_log(readings)
         except BayesImpedanceError as error:
             return replace(result, refusal=str(error), repairs=tuple(repairs))
+    clocks = _clocks(readings)
+    found = [finding for name, clock in clocks.items() for finding in of_clock(name, clock)]
+    found += [finding for reading in readings for finding in look_at(reading)]
     result = replace(
         result,
         log=log,
-        findings=tuple(dict.fromkeys(sentence for reading in readings for sentence in look_at(reading))),
-        clocks=_clocks(readings),
+        findings=tuple({finding.sentence: finding for finding in found}.values()),
+        clocks=clocks,
         law=_law(log),
         lag=_lag(log),
     )
@@ -176,4 +180,3 @@ def _smoothing(log: InteractionLog, smoother: Smoother | None) -> tuple[Smoother
             continue
     # Short windows end up as the shortest that the order allows.
     return tuple({round(effect.window, 9): effect for effect in effects}.values())
-

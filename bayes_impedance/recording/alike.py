@@ -65,6 +65,16 @@ class Alike:
             values = np.gradient(values, self.step, axis=0)
         return values[self._inner()]
 
+    def roughness(self, signal: Array, order: int = 0) -> float:
+        """Power of what half the window would leave more of a derivative of `signal (n, a)`, over that of the whole."""
+        finer = Alike(self.time, self.window / 2)
+        coarse, fine = (each._filtered(signal) for each in (self, finer))
+        for _ in range(order):
+            coarse, fine = (np.gradient(values, self.step, axis=0) for values in (coarse, fine))
+        inner = self._inner()
+        power = float(np.sum(coarse[inner] ** 2))
+        return float(np.sum((fine - coarse)[inner] ** 2)) / power if power > 0 else np.inf
+
     def _filtered(self, signal: Array) -> Array:
         even = np.stack([np.interp(self.grid, self.time, column) for column in signal.T], axis=1)
         return np.asarray(savgol_filter(even, self.length, ORDER, axis=0))

@@ -21,7 +21,7 @@ from bayes_impedance.log import Array
 from bayes_impedance.recording.spectra import Complex, CrossSpectra, cross_spectra, stretches, turned
 
 #: Lags that are looked at, either way, and the step between them [s].
-LARGEST, GRID = 0.1, 0.002
+LARGEST, GRID = 0.2, 0.002
 #: Two bands [Hz], each with a law of its own: an arm gives way to slow perturbations, and at high frequency only the
 #: sensor's noise drives a robot, so that M and D may differ where the lag may not.
 BANDS = ((1.0, 8.0), (8.0, 40.0))
@@ -71,16 +71,18 @@ def estimate_lag(
         (0.01, True)
     """
     added = np.zeros_like(force) if perturbation is None else perturbation
-    parts = list(stretches(time, np.concatenate([force, added, position], axis=1)))
     step = float(np.median(np.diff(time)))
+    parts = list(stretches(time, np.concatenate([force, added, position], axis=1), step))
     found: list[LagEstimate] = []
     shift = 0
     # A window cuts force where it cuts motion, so it is shifted by whole samples first.
     for _ in range(2):
-        spectra = cross_spectra(parts, step, shift, PARTS)
+        spectra = cross_spectra(parts, force.shape[1], step, shift, PARTS)
         if spectra is None:
             return _undetermined(f"expected at least {PARTS} windows of 2 s without gaps, found fewer")
         bands = [band for low, high in BANDS if len((band := spectra.between(low, high)).omega) >= 2]
+        if not bands:
+            return _undetermined(f"expected samples at 5 Hz or more, found {1 / step:.2g} Hz")
         found = [_of_band(band, shift * step) for band in bands]
         shift = round(_surest(found).lag / step)
     return _agreed(found)
@@ -121,8 +123,11 @@ def _of_band(spectra: CrossSpectra, shift: float) -> LagEstimate:
         profile = _Profile(total, spectra.omega, weights, spectra.axes)
         lag = _best(profile, shift)
         left, whole = profile.spectrum(lag)
-        explained = 1.0 - float((weights * left).sum() / (weights * whole).sum())
-        weights = _inverse(uniform_filter1d(left, 5, axis=1))
+        power = float((weights * whole).sum())
+        explained = 1.0 - float((weights * left).sum()) / power if power > 0 else 0.0
+        # Where motion is noise, its coefficients add noise; to count that would make a lag with less damping look best.
+        held = np.maximum(1.0 - left * _inverse(whole), 0.0)
+        weights = uniform_filter1d(held, 5, axis=1) * _inverse(uniform_filter1d(left, 5, axis=1))
     # Each looks at all lags: where two are about as good, the jackknife jumps from one to the other.
     without = np.array(
         [_best(_Profile(total - part, spectra.omega, weights, spectra.axes), shift) for part in spectra.parts]

@@ -17,6 +17,8 @@ from bayes_impedance.recording.alike import Alike
 RATIO_TOLERANCE, LAG_TOLERANCE = 0.1, 0.02
 #: Correlation with the derivative of position below which a ratio means nothing.
 SMALLEST_CORRELATION = 0.7
+#: Of two signals with less roughness than this noise is no excuse.
+LARGEST_ROUGHNESS = 0.1
 #: Standard errors from zero that make a sign certain.
 SURE = 3.0
 
@@ -39,9 +41,26 @@ class VelocityMismatch:
         )
 
 
+@dataclass(frozen=True)
+class VelocityUnrelated:
+    """A velocity that is no multiple of the derivative of position: their `correlation` [1], free of noise."""
+
+    channel: str
+    correlation: float
+
+    @property
+    def sentence(self) -> str:
+        """What it is and how to mend it."""
+        return (
+            f"{self.channel}: velocity goes another way than the derivative of position (correlation "
+            f"{self.correlation:.2f}), and noise does not explain it; set log.columns.velocity to null so that it is "
+            "taken from position, or name the column that is meant"
+        )
+
+
 def velocity_mismatch(
     time: Array, position: Array, velocity: Array, channel: str, window: float = 0.3
-) -> VelocityMismatch | None:
+) -> VelocityMismatch | VelocityUnrelated | None:
     """Velocity `(n,)` [m/s] against the derivative of position `(n,)` [m], smoothed alike over `window` [s].
 
         v(t) ≈ r ẋ(t − τ) ≈ r ẋ − r τ ẍ
@@ -55,8 +74,12 @@ def velocity_mismatch(
     v, x = alike.smooth(velocity[:, None]), position[:, None]
     slope, curvature = alike.derivative(x), alike.derivative(x, order=2)
     scale = float(np.sqrt(np.sum(v**2) * np.sum(slope**2)))
-    if scale == 0 or abs(float(np.sum(v * slope))) < SMALLEST_CORRELATION * scale:
+    if scale == 0:
         return None
+    correlation = float(np.sum(v * slope)) / scale
+    if abs(correlation) < SMALLEST_CORRELATION:
+        noisy = max(alike.roughness(velocity[:, None]), alike.roughness(x, order=1)) > LARGEST_ROUGHNESS
+        return None if noisy else VelocityUnrelated(channel, correlation)
     ratio, bent = least_squares.fit(np.stack([slope, curvature], axis=2), v).coefficients
     lag = float(-bent / ratio)
     if abs(ratio - 1.0) <= RATIO_TOLERANCE and abs(lag) <= max(LAG_TOLERANCE, 2 * alike.step):

@@ -1,4 +1,4 @@
-"""Cross-spectra of force and motion over overlapping windows: all that the estimate of their lag asks of a recording."""
+"""Cross-spectra of force and motion over overlapping windows, all that an estimate of their lag needs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 
 from bayes_impedance.log import Array
-from bayes_impedance.recording.clock import long_steps
+from bayes_impedance.recording.clock import GAP
 
 Complex = npt.NDArray[np.complex128]
 
@@ -53,13 +53,12 @@ def turned(lags: Array, omega: Array) -> Complex:
     return phase[..., None] * np.stack([np.ones_like(angle), np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def stretches(time: Array, channels: Array) -> Iterator[Array]:
-    """`channels (n, c)` at even steps, one array for what lies between two gaps, or starts of trials."""
+def stretches(time: Array, channels: Array, step: float) -> Iterator[Array]:
+    """`channels (n, c)` at even steps of `step` [s], one array for what lies between two gaps, or starts of trials."""
     known = np.isfinite(channels).all(axis=1)
     time, channels = time[known], channels[known]
     steps = np.diff(time)
-    step = float(np.median(steps))
-    edges = np.flatnonzero(long_steps(time) | (steps <= 0)) + 1
+    edges = np.flatnonzero((steps > GAP * step) | (steps <= 0)) + 1
     for start, end in zip([0, *edges], [*edges, len(time)], strict=True):
         if end - start > 1:
             part = slice(start, end)
@@ -67,12 +66,13 @@ def stretches(time: Array, channels: Array) -> Iterator[Array]:
             yield PchipInterpolator(time[part], channels[part])(grid)
 
 
-def cross_spectra(parts: list[Array], step: float, shift: int, n_parts: int) -> CrossSpectra | None:
+def cross_spectra(
+    parts: list[Array], axes: int, step: float, shift: int, n_parts: int
+) -> CrossSpectra | None:
     """Of stretches `(n, 3 axes)` of force, perturbation and position; force taken `shift` samples later.
 
     None where there are fewer windows than `n_parts`.
     """
-    axes = parts[0].shape[1] // 3
     length = round(WINDOW / step)
     windows = [window for part in parts for window in _windows(_channels(part, step, shift, axes), length)]
     if len(windows) < n_parts:
@@ -90,7 +90,7 @@ def cross_spectra(parts: list[Array], step: float, shift: int, n_parts: int) -> 
         tapered = [*(taper * force for taper in tapers), (tapers[0] + tapers[1]) * others]
         z = np.fft.rfft(np.concatenate(tapered, axis=1), axis=0)[chosen]
         sums[number * n_parts // len(windows)] += z[:, :, None] * z[:, None, :].conj()
-    return CrossSpectra(omega, sums, axes)
+    return CrossSpectra(np.asarray(omega, dtype=np.float64), sums, axes)
 
 
 def _channels(part: Array, step: float, shift: int, axes: int) -> Array:
@@ -101,8 +101,8 @@ def _channels(part: Array, step: float, shift: int, axes: int) -> Array:
     force = part[max(shift, 0) :, :axes][:n]
     others = part[max(-shift, 0) :, axes:][:n]
 
-    # Not Savitzky–Golay: its orders differ in their frequency response, and a response of velocity that falls off
-    # otherwise than that of acceleration looks like a lag. The derivatives of one Gaussian are consistent.
+    # Not Savitzky–Golay: the frequency responses of its derivatives fall off differently, which at .1 s looks like a
+    # lag of up to .1 ms. The derivatives of one Gaussian are consistent, and no window has to be chosen.
     def filtered(values: Array, order: int = 0) -> Array:
         smooth: Array = gaussian_filter1d(values, SIGMA, axis=0, order=order, radius=REACH) / step**order
         return smooth[REACH:-REACH]

@@ -13,14 +13,14 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from bayes_impedance.errors import LogError, LogWarning
 from bayes_impedance.log import Array, Integers
-from bayes_impedance.recording.clock import ClockOffset
+from bayes_impedance.recording.offset import ClockOffset
 
 #: Two clocks that arrivals put this close [s] are taken for one: messages differ by more in their shortest way.
 SAME_CLOCK = 2e-3
 #: A stream with so many samples an interval of the base is averaged, for interpolation would alias it.
 FASTER = 1.5
 #: A gap is longer than so many medians of the stream's own steps, and than `max_gap`.
-GAP = 5.0
+LONG = 5.0
 #: Longest gap that is bridged [s]: within it nobody's force turns round.
 MAX_GAP = 0.03
 
@@ -138,7 +138,7 @@ def on_clock_of(base: Stream, other: Stream) -> Array:
 def in_gap(at: Array, time: Array, reach: float, max_gap: float) -> Booleans:
     """Which of the times `at (m,)` [s], or what is within `reach` [s] of them, lie in a gap of `time (n,)`, `(m,)`."""
     steps = np.diff(time)
-    long = np.flatnonzero(steps > max(GAP * float(np.median(steps)), max_gap))
+    long = np.flatnonzero(steps > max(LONG * float(np.median(steps)), max_gap))
     # Gaps that end after the sample begins; the first of them is the only one that it can lie in.
     first = np.searchsorted(time[long + 1], at - reach, side="right")
     starts = np.append(time[long], np.inf)
@@ -169,7 +169,7 @@ def turned_to(at: Array, time: Array, columns: Array, rotation: str) -> Array:
     with warnings.catch_warnings():
         # Where two axes coincide the angles are not unique; any that give the orientation will do.
         warnings.filterwarnings("ignore", message="Gimbal lock detected", category=UserWarning)
-        angles: Array = between.as_euler(rotation)
+        angles: Array = between.as_euler(rotation)  # type: ignore[call-overload]  # axes that the configuration checked
     return angles
 
 
