@@ -8,6 +8,7 @@ from bayes_impedance.config.inference import BaselineConfig as BaselineConfig
 from bayes_impedance.config.inference import EngineConfig as EngineConfig
 from bayes_impedance.config.inference import TrainingConfig as TrainingConfig
 from bayes_impedance.config.loading import Config as Config
+from bayes_impedance.config.loading import as_yaml as as_yaml
 from bayes_impedance.config.loading import dump_config as dump_config
 from bayes_impedance.config.loading import load_config as load_config
 from bayes_impedance.config.loading import parse_config as parse_config

@@ -152,7 +152,12 @@ def replace_value(config: Config, key: str, value: Any) -> Config:
 
 def dump_config(config: Config) -> str:
     """The whole configuration, defaults included, as YAML."""
-    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+    return as_yaml(config.model_dump(mode="json"))
+
+
+def as_yaml(content: Mapping[str, Any]) -> str:
+    """Plain mappings as the text of a configuration."""
+    return yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True)
 
 
 def _override(content: dict[str, Any], assignment: str) -> dict[str, Any]:

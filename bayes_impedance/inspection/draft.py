@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import yaml
 
-from bayes_impedance.config import Columns, LogConfig, parse_config
+from bayes_impedance.config import Columns, LogConfig, as_yaml, parse_config
 from bayes_impedance.errors import LogError
 from bayes_impedance.inspection.guess import (
     guess_columns,
@@ -168,7 +167,7 @@ def _text(
     head = "\n".join(f"# {line}".rstrip() for line in lines)
     ordered = {key: content[key] for key in ("extends", "log", "preprocessing") if key in content}
     ordered |= {key: value for key, value in content.items() if key not in ordered}
-    body = yaml.safe_dump(ordered, sort_keys=False, allow_unicode=True) if ordered else "{}\n"
+    body = as_yaml(ordered) if ordered else "{}\n"
     return f"{head}\n\n{body}{_device(inspection)}"
 
 

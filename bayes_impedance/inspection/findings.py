@@ -68,8 +68,9 @@ def middle_of(samples: Samples) -> Samples:
 def _of_quantity(key: str, values: Array, axes: Sequence[str]) -> Iterator[Finding]:
     names = [f"{key}_{axis}" for axis in (axes if values.shape[1] == len(axes) else AXES)]
     for name, channel in zip(names, values.T, strict=True):
-        checks = [saturation, held_samples] + ([dead_band] if key == "force" else [])
-        for check in checks:
+        # A position comes to rest, and stops there.
+        limits = [] if key == "position" else [saturation]
+        for check in (*limits, held_samples, *([dead_band] if key == "force" else [])):
             finding = check(channel, name)
             if finding is not None:
                 yield finding

@@ -114,14 +114,18 @@ def saturation(values: Array, channel: str) -> Saturation | None:
         return None
     tolerance = ROUNDING * float(np.abs(values).max())
     found = []
-    for extreme in (values.max(), values.min()):
+    extremes = (values.max(), values.min())
+    # A sensor may stop on both sides: neither tells how long values are held by chance.
+    between = np.abs(values - extremes[0]) > tolerance
+    between &= np.abs(values - extremes[1]) > tolerance
+    elsewhere = _lengths(_repeated(values) & between & (np.abs(values) > tolerance)) + 1
+    held = int(np.quantile(elsewhere, 0.99)) if len(elsewhere) else 1
+    for extreme in extremes:
         # A channel that rests at zero has not hit a limit.
         if abs(extreme) <= tolerance:
             continue
         at = np.abs(values - extreme) <= tolerance
         stops = _lengths(at)
-        elsewhere = _lengths(_repeated(values) & ~at & (np.abs(values) > tolerance)) + 1
-        held = int(np.quantile(elsewhere, 0.99)) if len(elsewhere) else 1
         # Two stops, or one that is much too long for a value held by chance.
         long = stops[stops >= max(SHORTEST_STOP, 2 * held)]
         if len(long) > 1 or long.max(initial=0) >= 3 * max(SHORTEST_STOP, held):

@@ -26,6 +26,13 @@ def bag(shared_data):
 # --- dead band -----------------------------------------------------------------------------------
 
 
+def test_a_sensor_that_stops_on_both_sides():
+    time = np.arange(4000) / 100.0
+    found = saturation(np.clip(8 * np.sin(2 * time), -5, 5), "force_x")
+    assert found is not None
+    assert abs(found.value) == 5.0
+
+
 def test_a_hard_dead_band_shows_its_width():
     found = dead_band(np.where(np.abs(NOISY) < 1.5, 0.0, NOISY), "force_x")
     assert found.share == pytest.approx(np.mean(np.abs(NOISY) < 1.5))
