@@ -51,6 +51,11 @@ READERS = (
     "readers.columns",
     "readers.text",
     "readers.parquet",
+    "readers.layout",
+    "readers.bounded",
+    "readers.bags",
+    "readers.topics",
+    "readers.messages",
     "readers.samples",
     "readers.trials",
     "readers.read",
@@ -129,6 +134,8 @@ CONFINED = {
     "safetensors": {"persistence"},
     "pyarrow": {"readers.parquet"},
     "filelock": {"journal"},
+    "rosbags": {"readers.bags", "readers.bounded"},
+    "lz4": {"readers.bounded"},
 }
 
 
