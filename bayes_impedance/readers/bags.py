@@ -69,7 +69,9 @@ class Bag:
         with _opened(self.file, self.source) as reader:
             chosen = [connection for connection in reader.connections if connection.topic in topics]
             for connection, time, raw in reader.messages(chosen):
-                yield connection.topic, *_checked(time, raw)
+                # A damaged index leads to messages of other topics.
+                if connection.topic in topics:
+                    yield connection.topic, *_checked(time, raw)
 
 
 def read_bag(file: Path, source: str) -> Bag:

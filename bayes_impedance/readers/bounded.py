@@ -26,7 +26,7 @@ class BoundedFile(io.BufferedReader):
         self.end = os.fstat(self.fileno()).st_size
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """At most `size` bytes [byte], or all that remain."""
+        """At most `size` bytes, or all that remain."""
         remaining = max(0, self.end - self.tell())
         return super().read(remaining if size is None or not 0 <= size <= remaining else size)
 
