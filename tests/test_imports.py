@@ -51,6 +51,11 @@ READERS = (
     "readers.columns",
     "readers.text",
     "readers.parquet",
+    "readers.layout",
+    "readers.bounded",
+    "readers.bags",
+    "readers.topics",
+    "readers.messages",
     "readers.samples",
     "readers.force",
     "readers.trials",
@@ -170,6 +175,8 @@ CONFINED = {
     "pyarrow": {"readers.parquet"},
     "filelock": {"journal"},
     "dtaidistance": {"preprocessing.warping"},
+    "rosbags": {"readers.bags", "readers.bounded"},
+    "lz4": {"readers.bounded"},
 }
 
 

@@ -124,6 +124,8 @@ def of_axis(template: str, axis: str) -> str:
 
 
 def _missing(table: Table, key: str, name: str, optional: bool = False) -> LogError:
+    if key in table.absent:
+        return table.absent[key]
     by_lower_case = {column.lower(): column for column in table.columns}
     near = difflib.get_close_matches(name.lower(), by_lower_case, n=1, cutoff=0.3)
     found = f"the nearest is {by_lower_case[near[0]]!r}" if near else f"there is {_listed(table.columns)}"

@@ -9,6 +9,7 @@ from bayes_impedance.config import LogConfig
 from bayes_impedance.errors import LogError
 from bayes_impedance.log import InteractionLog
 from bayes_impedance.readers.cells import brief
+from bayes_impedance.readers.messages import open_messages
 from bayes_impedance.readers.parquet import open_parquet
 from bayes_impedance.readers.table import Opened
 from bayes_impedance.readers.text import open_text
@@ -18,6 +19,7 @@ from bayes_impedance.readers.trials import Reading, read_trials
 OPENERS: dict[str, Callable[[Path, str, LogConfig], Opened]] = {
     **dict.fromkeys((".csv", ".tsv", ".txt"), open_text),
     **dict.fromkeys((".parquet", ".pq"), open_parquet),
+    **dict.fromkeys((".bag", ".db3", ".mcap"), open_messages),
 }
 
 
@@ -117,19 +119,21 @@ def open_file(file: Path, source: str, config: LogConfig) -> Opened:
     Raises:
         LogError: it is missing, unreadable, or of no known format.
     """
-    if file.is_dir():
+    # ROS 2 records into a folder.
+    recorded = (file / "metadata.yaml").is_file()
+    if file.is_dir() and not recorded:
         raise LogError(f"{source}: expected a file, found a folder; name the recordings in it")
     if not file.exists():
         raise LogError(f"{source}: expected a recording, found no such file at '{file}'; check the path")
     ending = file.suffix.lower()
-    if ending not in OPENERS:
+    if ending not in OPENERS and not recorded:
         *others, last = OPENERS
         raise LogError(
             f"{source}: expected a file that ends in {', '.join(others)} or {last}, found "
             f"{repr(file.suffix) if ending else 'no ending'}; convert it, or rename it if it is one of these"
         )
     try:
-        return OPENERS[ending](file, source, config)
+        return (open_messages if recorded else OPENERS[ending])(file, source, config)
     except OSError as error:
         raise LogError(
             f"{source}: expected a readable file, found: {brief(error)}; check the file"

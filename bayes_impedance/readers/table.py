@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import pandas as pd
 
 from bayes_impedance.config import LogConfig
+from bayes_impedance.errors import LogError
 from bayes_impedance.log import Array, RowNumbers
 
 
@@ -33,7 +34,8 @@ class Table:
 
     `load(names, labels)` reads columns, those in `labels` as text, a stream for each set of time stamps. `trial`: its
     name where a file holds several recordings (a group of HDF5, an element of a MATLAB array). `timed`: streams carry
-    the stamps of their messages, so that no column tells the time.
+    the stamps of their messages, so that no column tells the time. `absent`: what to say of quantities that were sought
+    in vain, where the reader knows better than that a column lacks.
     """
 
     source: str
@@ -41,6 +43,7 @@ class Table:
     load: Callable[[Sequence[str], Collection[str]], list[Stream]]
     trial: str | None = None
     timed: bool = False
+    absent: Mapping[str, LogError] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
