@@ -51,6 +51,13 @@ READERS = (
     "readers.columns",
     "readers.text",
     "readers.parquet",
+    "readers.tree",
+    "readers.arrays",
+    "readers.numpy_archive",
+    "readers.hdf5",
+    "readers.matlab_elements",
+    "readers.matlab_hdf5",
+    "readers.matlab",
     "readers.samples",
     "readers.trials",
     "readers.read",
@@ -128,6 +135,7 @@ CONFINED = {
     "yaml": {"config.loading"},
     "safetensors": {"persistence"},
     "pyarrow": {"readers.parquet"},
+    "h5py": {"readers.hdf5", "readers.matlab_hdf5"},
     "filelock": {"journal"},
 }
 

@@ -9,6 +9,9 @@ from bayes_impedance.config import LogConfig
 from bayes_impedance.errors import LogError
 from bayes_impedance.log import InteractionLog
 from bayes_impedance.readers.cells import brief
+from bayes_impedance.readers.hdf5 import open_hdf5
+from bayes_impedance.readers.matlab import open_mat
+from bayes_impedance.readers.numpy_archive import open_npz
 from bayes_impedance.readers.parquet import open_parquet
 from bayes_impedance.readers.table import Opened
 from bayes_impedance.readers.text import open_text
@@ -18,6 +21,9 @@ from bayes_impedance.readers.trials import read_trials
 OPENERS: dict[str, Callable[[Path, str, LogConfig], Opened]] = {
     **dict.fromkeys((".csv", ".tsv", ".txt"), open_text),
     **dict.fromkeys((".parquet", ".pq"), open_parquet),
+    **dict.fromkeys((".h5", ".hdf5"), open_hdf5),
+    ".mat": open_mat,
+    ".npz": open_npz,
 }
 
 
