@@ -26,16 +26,19 @@ def open_mat(file: Path, source: str, config: LogConfig) -> Opened:
     Raises:
         LogError: it is none, is truncated, or holds no position.
     """
-    data = io.BytesIO(file.read_bytes())
+    # What the disk refuses is no fault of the format.
+    file.open("rb").close()
     with broken_file(source, EXPECTED):
-        version, _ = matfile_version(data)
+        version, _ = matfile_version(file)
         if version == 2:
             tree = matlab_hdf5.tree_of(file, source)
         else:
+            data = file.read_bytes()
             if version == 1:
-                check_elements(data.getvalue())
-            # Numbers of the type that they have in the file, for all become float64 in the end.
-            variables = scipy.io.loadmat(data, mat_dtype=False)
+                check_elements(data)
+            # From memory, where a length beyond the end takes none.
+            buffer: Any = io.BytesIO(data)
+            variables = scipy.io.loadmat(buffer)
             tree = _Variables(source).struct(
                 {name: value for name, value in variables.items() if not name.startswith("__")}
             )

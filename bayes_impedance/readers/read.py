@@ -8,7 +8,7 @@ from pathlib import Path
 from bayes_impedance.config import LogConfig
 from bayes_impedance.errors import LogError
 from bayes_impedance.log import InteractionLog
-from bayes_impedance.readers.cells import brief
+from bayes_impedance.readers.cells import readable
 from bayes_impedance.readers.hdf5 import open_hdf5
 from bayes_impedance.readers.matlab import open_mat
 from bayes_impedance.readers.numpy_archive import open_npz
@@ -101,9 +101,5 @@ def open_file(file: Path, source: str, config: LogConfig) -> Opened:
             f"{source}: expected a file that ends in {', '.join(others)} or {last}, found "
             f"{repr(file.suffix) if ending else 'no ending'}; convert it, or rename it if it is one of these"
         )
-    try:
+    with readable(source):
         return OPENERS[ending](file, source, config)
-    except OSError as error:
-        raise LogError(
-            f"{source}: expected a readable file, found: {brief(error)}; check the file"
-        ) from error
