@@ -15,7 +15,7 @@ from pandas.api.types import union_categoricals
 
 from bayes_impedance.config import LogConfig
 from bayes_impedance.errors import LogError
-from bayes_impedance.log import RowNumbers
+from bayes_impedance.log import Integers, RowNumbers
 from bayes_impedance.readers.cells import MISSING, is_number, readable
 from bayes_impedance.readers.table import Opened, Stream, Table
 
@@ -27,9 +27,11 @@ PIECE = 8 * 2**20
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 
 
-class _Line(NamedTuple):
-    number: int
-    text: str
+class _Lines(NamedTuple):
+    """Lines that are not blank, with their numbers in the file."""
+
+    numbers: Integers
+    texts: list[str]
 
 
 def open_text(file: Path, source: str, config: LogConfig) -> Opened:
@@ -39,12 +41,12 @@ def open_text(file: Path, source: str, config: LogConfig) -> Opened:
         LogError: names file and line.
     """
     # A line may be all that a piece holds.
-    beginning = list(islice((line for lines in _pieces(file, source) for line in lines), 2))
+    beginning = list(islice((line for lines in _pieces(file, source) for line in lines.texts), 2))
     if not beginning:
         raise LogError(
             f"{source}: expected a header line and samples, found an empty file; record or export it anew"
         )
-    head = beginning[0].text
+    head = beginning[0]
     delimiter = config.delimiter
     if delimiter is None:
         delimiter = next((character for character in "\t;," if character in head), " ")
@@ -59,12 +61,12 @@ def open_text(file: Path, source: str, config: LogConfig) -> Opened:
         )
 
     def load(names: Sequence[str], labels: Collection[str]) -> list[Stream]:
-        numbers: list[np.ndarray[Any, Any]] = []
+        numbers: list[Integers] = []
         parts: dict[str, list[pd.Series[Any]]] = {name: [] for name in names}
         with readable(source):
             for lines in _bodies(file, source):
                 _check_widths(lines, delimiter, len(header), source)
-                numbers.append(np.array([line.number for line in lines], dtype=np.int64))
+                numbers.append(lines.numbers)
                 frame = _parsed(lines, delimiter, header, names, labels)
                 for name in names:
                     parts[name].append(frame[str(header.index(name))])
@@ -78,16 +80,16 @@ def open_text(file: Path, source: str, config: LogConfig) -> Opened:
 # --- pieces --------------------------------------------------------------------------------------
 
 
-def _bodies(file: Path, source: str) -> Iterator[list[_Line]]:
+def _bodies(file: Path, source: str) -> Iterator[_Lines]:
     """Pieces without the header line."""
     pieces = _pieces(file, source)
-    first = next(pieces)[1:]
-    if first:
-        yield first
+    first = next(pieces)
+    if len(first.texts) > 1:
+        yield _Lines(first.numbers[1:], first.texts[1:])
     yield from pieces
 
 
-def _pieces(file: Path, source: str) -> Iterator[list[_Line]]:
+def _pieces(file: Path, source: str) -> Iterator[_Lines]:
     """Lines that are not blank, some at a time.
 
     Raises:
@@ -107,9 +109,11 @@ def _pieces(file: Path, source: str) -> Iterator[list[_Line]]:
                 f"{source}: expected text, found binary data; rename the file by its format, or export it anew"
             )
         lines = text.replace("\r\n", "\n").replace("\r", "\n").removesuffix("\n").split("\n")
-        kept = [_Line(number, line) for number, line in enumerate(lines, start=count + 1) if line.strip()]
-        if kept:
-            yield kept
+        kept = np.flatnonzero([bool(line.strip()) for line in lines])
+        if len(kept):
+            yield _Lines(
+                count + 1 + kept, lines if len(kept) == len(lines) else [lines[index] for index in kept]
+            )
         count += len(lines)
         position += len(data)
 
@@ -132,23 +136,24 @@ def _blocks(file: Path) -> Iterator[bytes]:
 # --- cells ---------------------------------------------------------------------------------------
 
 
-def _check_widths(lines: Sequence[_Line], delimiter: str, expected: int, source: str) -> None:
+def _check_widths(lines: _Lines, delimiter: str, expected: int, source: str) -> None:
     """Pandas would shift or drop cells of a line that is too long without a word."""
-    for number, line in lines:
-        width = (
-            line.count(delimiter) + 1
-            if delimiter != " " and '"' not in line
-            else len(_cells(line, delimiter, source))
+    widths = [
+        line.count(delimiter) + 1
+        if delimiter != " " and '"' not in line
+        else len(_cells(line, delimiter, source))
+        for line in lines.texts
+    ]
+    wrong = np.flatnonzero(np.array(widths) != expected)
+    if len(wrong):
+        raise LogError(
+            f"{source}, line {lines.numbers[wrong[0]]}: expected {expected} cells as in the header, found "
+            f"{widths[wrong[0]]}; mend the line, set log.delimiter, or write decimals with a point"
         )
-        if width != expected:
-            raise LogError(
-                f"{source}, line {number}: expected {expected} cells as in the header, found {width}; "
-                "mend the line, set log.delimiter, or write decimals with a point"
-            )
 
 
 def _parsed(
-    lines: Sequence[_Line],
+    lines: _Lines,
     delimiter: str,
     header: Sequence[str],
     names: Sequence[str],
@@ -156,7 +161,7 @@ def _parsed(
 ) -> pd.DataFrame:
     at = {name: str(header.index(name)) for name in names}
     return pd.read_csv(
-        io.StringIO("\n".join(line.text for line in lines)),
+        io.StringIO("\n".join(lines.texts)),
         sep=r"\s+" if delimiter == " " else delimiter,
         header=None,
         names=[str(index) for index in range(len(header))],

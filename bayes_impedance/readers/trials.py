@@ -32,7 +32,7 @@ def _trials(table: Table, samples: Samples) -> list[Trial]:
     codes, names = pd.factorize(samples.labels.get("trial", everything))
     trials = []
     for code, name in enumerate(names):
-        own = np.flatnonzero(codes == code)
+        own = np.flatnonzero(codes == code) if len(names) > 1 else slice(None)
         groups = list(dict.fromkeys(samples.labels["group"][own])) if "group" in samples.labels else ["0"]
         if len(groups) > 1:
             raise LogError(
