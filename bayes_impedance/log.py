@@ -363,7 +363,7 @@ def _numbers(trial: Trial, column: str, values: npt.ArrayLike) -> Array:
         array = np.asarray(values)
         if array.dtype.kind not in "fiubO":
             raise TypeError
-        return array.astype(np.float64)
+        return array.astype(np.float64, copy=False)
     except (TypeError, ValueError) as error:
         raise LogError(
             f"{_at(trial)}, column {column}: expected real numbers, found something else; "

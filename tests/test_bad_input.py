@@ -249,8 +249,8 @@ CASES: dict[str, tuple[Callable[[Bench], Arguments], tuple[str, ...]]] = {
     "folder": (lambda bench: bench.train(bench.folder), ("expected a file, found a folder; name the recordings",)),
     "name too long": (lambda bench: bench.train(Path("a" * 300 + ".csv")), ("a{300}.csv: .*File name too long",)),
     "unknown ending": (
-        text("time", "bad.mat"),
-        (r"bad\.mat: expected a file that ends in .*, found '\.mat'; convert",),
+        text("time", "bad.xlsx"),
+        (r"bad\.xlsx: expected a file that ends in .*, found '\.xlsx'; convert",),
     ),
     "same file twice": (
         lambda bench: bench.train(bench.log, bench.log),

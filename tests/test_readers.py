@@ -448,11 +448,11 @@ def test_refuses_files_it_cannot_read(tmp_path, file):
 def test_refuses_an_unreadable_file(file, monkeypatch):
     path = file(HEAD + "0,1,1,a\n1,2,1,b\n")
 
-    def refuse(self):
+    def refuse(self, mode):
         raise PermissionError(13, "Permission denied")
 
     # Taking the permission away does not keep root from reading.
-    monkeypatch.setattr(Path, "read_bytes", refuse)
+    monkeypatch.setattr(Path, "open", refuse)
     with pytest.raises(
         LogError, match=r"log.csv: expected a readable file, found: Permission denied; check the file"
     ):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -95,6 +97,21 @@ def _number(value: Any) -> float:
 def is_number(text: str) -> bool:
     """Whether a cell of text is a number."""
     return not np.isnan(_number(text))
+
+
+@contextmanager
+def readable(source: str) -> Iterator[None]:
+    """What the disk or the system refuses as an error of ours.
+
+    Raises:
+        LogError: an OSError came up.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise LogError(
+            f"{source}: expected a readable file, found: {brief(error)}; check the file"
+        ) from error
 
 
 def brief(error: Exception) -> str:

@@ -40,8 +40,8 @@ def open_parquet(file: Path, source: str, config: LogConfig) -> Opened:
     def load(names: Sequence[str], _: Collection[str]) -> list[Stream]:
         try:
             with pq.ParquetFile(file) as parquet:
-                table = parquet.read(columns=list(names))
-                series = {name: table.column(name).to_pandas() for name in names}
+                # One after the other, so that Arrow's copy of a column goes before the next comes.
+                series = {name: parquet.read(columns=[name]).column(name).to_pandas() for name in names}
         except UNREADABLE as error:
             raise LogError(
                 f"{source}: expected a readable table, found: {brief(error)}; write it anew"

@@ -8,8 +8,11 @@ from pathlib import Path
 from bayes_impedance.config import LogConfig
 from bayes_impedance.errors import LogError
 from bayes_impedance.log import InteractionLog
-from bayes_impedance.readers.cells import brief
+from bayes_impedance.readers.cells import readable
+from bayes_impedance.readers.hdf5 import open_hdf5
+from bayes_impedance.readers.matlab import open_mat
 from bayes_impedance.readers.messages import open_messages
+from bayes_impedance.readers.numpy_archive import open_npz
 from bayes_impedance.readers.parquet import open_parquet
 from bayes_impedance.readers.table import Opened
 from bayes_impedance.readers.text import open_text
@@ -20,6 +23,9 @@ OPENERS: dict[str, Callable[[Path, str, LogConfig], Opened]] = {
     **dict.fromkeys((".csv", ".tsv", ".txt"), open_text),
     **dict.fromkeys((".parquet", ".pq"), open_parquet),
     **dict.fromkeys((".bag", ".db3", ".mcap"), open_messages),
+    **dict.fromkeys((".h5", ".hdf5"), open_hdf5),
+    ".mat": open_mat,
+    ".npz": open_npz,
 }
 
 
@@ -132,9 +138,5 @@ def open_file(file: Path, source: str, config: LogConfig) -> Opened:
             f"{source}: expected a file that ends in {', '.join(others)} or {last}, found "
             f"{repr(file.suffix) if ending else 'no ending'}; convert it, or rename it if it is one of these"
         )
-    try:
+    with readable(source):
         return (open_messages if recorded else OPENERS[ending])(file, source, config)
-    except OSError as error:
-        raise LogError(
-            f"{source}: expected a readable file, found: {brief(error)}; check the file"
-        ) from error

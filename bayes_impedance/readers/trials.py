@@ -46,9 +46,10 @@ def _trials(table: Table, samples: Samples, config: LogConfig) -> list[Trial]:
     codes, names = pd.factorize(samples.labels.get("trial", everything))
     trials = []
     for code, name in enumerate(names):
-        own = np.flatnonzero(codes == code)
+        own: Any = np.flatnonzero(codes == code) if len(names) > 1 else slice(None)
         if config.clock.duplicates == "drop":
-            own = own[np.diff(samples.time[own], prepend=-np.inf) != 0]
+            new = np.diff(samples.time[own], prepend=-np.inf) != 0
+            own = np.arange(len(samples.time))[own][new]
         groups = list(dict.fromkeys(samples.labels["group"][own])) if "group" in samples.labels else ["0"]
         if len(groups) > 1:
             raise LogError(
