@@ -160,7 +160,7 @@ def _kept(stamps: Array, source: str, config: ClockConfig, place: str) -> Intege
 def _compared(sent: Array, received: Array) -> tuple[ClockOffset | None, str]:
     """The sender's clock against the recorder's, or why the arrivals say nothing of it."""
     offset = compare_clocks(sent, received)
-    if abs(offset.drift) > LARGEST_DRIFT + 3 * offset.drift_error:
+    if abs(offset.rate) > 1e-6 * LARGEST_DRIFT + 3 * offset.rate_error:
         return None, (
             f"record stamps span {np.ptp(received):.3g} s where header stamps span {np.ptp(sent):.3g} s: they tell "
             "when messages were written, not when they arrived"

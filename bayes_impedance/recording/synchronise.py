@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -70,13 +70,14 @@ def synchronise(
     `align` maps their clocks onto that of the base. A faster stream is averaged over one interval of the base around
     each sample, so that it is neither aliased nor late; a slower one is interpolated by monotone cubics; orientation
     turns at a steady rate from one sample to the next. Nothing is made up in a gap of more than five median steps and
-    `max_gap` [s]. `place` names the source in errors.
+    `max_gap` [s]; samples of `others` with NaN count as missing. `place` names the source in errors.
 
     Warns (LogWarning) where a clock cannot be mapped.
 
     Raises:
         LogError: there is no time at which all streams have samples.
     """
+    others = [_known(other, place) for other in others]
     times = [on_clock_of(base, other) if align else other.time for other in others]
     half = 0.5 * float(np.median(np.diff(base.time)))
     reaches = [half if _is_averaged(base, other) else 0.0 for other in others]
@@ -178,6 +179,17 @@ def as_rotation(columns: Array, rotation: str) -> Rotation:
     if rotation.startswith("quaternion"):
         return Rotation.from_quat(columns, scalar_first=rotation.endswith("wxyz"))
     return Rotation.from_euler(rotation, columns)
+
+
+def _known(stream: Stream, place: str) -> Stream:
+    """The samples whose columns are all finite."""
+    known = np.isfinite(stream.columns).all(axis=1)
+    if known.sum() < 2:
+        raise LogError(
+            f"{place}: expected {stream.name} to hold at least two samples of numbers, found {known.sum()}; leave its "
+            "columns out of log.columns"
+        )
+    return replace(stream, time=stream.time[known], columns=stream.columns[known])
 
 
 def _is_averaged(base: Stream, other: Stream) -> bool:

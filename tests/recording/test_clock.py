@@ -164,6 +164,18 @@ def test_a_constant_header_makes_way_for_the_record(stamp: float) -> None:
     assert clock.report.against_recorder is None and clock.report.remark == clock.report.why
 
 
+@pytest.mark.parametrize("received", [np.full(100, 7.0), np.linspace(7.0, 7.01, 100)])
+def test_arrivals_all_at_once_say_nothing_of_the_clock(received: Array) -> None:
+    clock = choose_clock(5.0 + np.arange(100) / 100.0, received, ClockConfig())
+    assert clock.report.source == "header" and clock.against_recorder is None
+    assert clock.report.remark.endswith("they tell when messages were written, not when they arrived")
+
+
+def test_two_messages_are_enough_for_a_clock() -> None:
+    clock = choose_clock(np.array([5.0, 5.1]), np.array([7.0, 7.1]), ClockConfig())
+    assert against(clock).offset == pytest.approx(-2.0)
+
+
 def test_the_configuration_may_choose() -> None:
     _, sent, received = messages(200.0, 5.0, 0.37, 0.0, seed=0, bursts=0)
     clock = choose_clock(sent, np.sort(received), ClockConfig(source="record"))
@@ -224,6 +236,17 @@ def test_a_gap_in_a_recording_is_listed(shared_data: Path) -> None:
     clock = of_bag(shared_data / "gp_mpc" / "loader_edge_cases" / "var_wd_cc_1_590ms_gap.bag")
     lengths = [length for _, length in clock.report.gaps]
     assert max(lengths) == pytest.approx(0.574, abs=0.001)
+
+
+def test_a_drift_in_a_recording_is_that_of_the_least_delays(shared_data: Path) -> None:
+    path = shared_data / "gp_mpc" / "loader_edge_cases" / "var_wd_cc_1_590ms_gap.bag"
+    read = states(path)
+    elapsed, delay = read.sent - read.sent[0], read.received - read.sent
+    parts = np.array_split(np.arange(len(delay)), 20)
+    least = [part[np.argmin(delay[part])] for part in parts]
+    slope = np.polyfit(elapsed[least], delay[least], 1)[0]
+    assert against(of_bag(path)).drift == pytest.approx(-1e6 * slope, abs=10.0)
+    assert -1e6 * slope < -150.0
 
 
 def test_thirty_messages_are_few_for_a_drift_and_say_so(shared_data: Path) -> None:

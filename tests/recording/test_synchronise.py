@@ -174,6 +174,18 @@ def test_no_force_is_made_up_in_a_gap() -> None:
     np.testing.assert_allclose(result.columns["force"], signal(result.time), atol=0.1)
 
 
+def test_samples_that_are_no_numbers_are_missing() -> None:
+    base = plain("motion", np.arange(1, 1000) / 100.0)
+    other = plain("force", np.arange(1001) / 100.0)
+    other.columns[501:510, 1] = np.nan
+    result = synchronise(base, [other])
+    assert result.left_out == {"force": 9}
+    np.testing.assert_allclose(result.columns["force"], signal(result.time), atol=1e-9)
+    other.columns[1:] = np.nan
+    with pytest.raises(LogError, match="expected force to hold at least two samples of numbers, found 1"):
+        synchronise(base, [other])
+
+
 def test_the_caller_decides_what_a_gap_is() -> None:
     base = plain("motion", np.arange(1, 1000) / 100.0)
     other = plain("force", np.delete(np.arange(1001) / 100.0, range(501, 510)))
