@@ -21,8 +21,8 @@ from bayes_impedance.inspection.guess import (
 from bayes_impedance.inspection.inspect import Inspection, inspect_recordings
 from bayes_impedance.log import AXES, Array
 from bayes_impedance.readers.columns import of_axis
-from bayes_impedance.readers.read import column_names, open_files
-from bayes_impedance.readers.table import Table
+from bayes_impedance.readers.read import open_files
+from bayes_impedance.readers.table import Opened, Table
 from bayes_impedance.recording.plausibility import VelocityMismatch, VelocityUnrelated
 
 #: Taken where nothing tells how far samples are apart [Hz].
@@ -64,19 +64,16 @@ def draft(files: Sequence[Path], overrides: Sequence[str] = (), known: Inspectio
 
 def _guessed_log(files: Sequence[Path]) -> tuple[dict[str, Any], list[str]]:
     """The section `log` from names and values of the first file, and what could not be told."""
-    found = guess_columns(column_names(files[0]))
+    (opened,) = open_files(files[:1], LogConfig())
+    found = _relative(guess_columns(_candidates(opened)))
     if "position" not in found:
-        # Opening says what there is.
-        list(open_files(files[:1], LogConfig()))
-        raise LogError(
-            f"{files[0].name}: expected names such as position_x, x or pos, found none that looks like a position; "
-            "name the columns in a configuration"
-        )
-    if "force" in found:
-        found = _relative(found)
+        for table in opened.tables:
+            # Formats that know what they sought say so.
+            raise next(iter(table.absent.values()), _nameless(opened.tables[0]))
     columns = {key: name for key, name in found.items() if name != Columns.model_fields[key].default}
-    log: dict[str, Any] = {"columns": columns} if columns else {}
-    (opened,) = open_files(files[:1], LogConfig.model_validate({"columns": columns, **_TIMELESS}))
+    stated = {key: name for key, name in columns.items() if name not in _defaults(opened, key)}
+    log: dict[str, Any] = {"columns": stated} if stated else {}
+    (opened,) = open_files(files[:1], LogConfig.model_validate({"columns": stated, **_TIMELESS}))
     table = opened.tables[0]
     position = _array(table, found["position"])
     remarks = []
@@ -86,12 +83,17 @@ def _guessed_log(files: Sequence[Path]) -> tuple[dict[str, Any], list[str]]:
     elif not table.timed:
         velocity = _array(table, found["velocity"]) if "velocity" in found else None
         rate = None if velocity is None else guess_sampling_rate(position, velocity)
-        log["columns"] = {"time": None} | columns
+        log["columns"] = {"time": None} | stated
         log["sampling_rate"] = round(PLACEHOLDER_RATE if rate is None else rate, 1)
         remarks.append(
             "no column of time was found: log.sampling_rate is a placeholder, set it"
             if rate is None
             else "no column of time was found: log.sampling_rate is that at which positions and velocities agree"
+        )
+    if "[{index}]" in found.get("force", "") and found["force"].startswith("/"):
+        remarks.append(
+            "a wrench hidden in a JointState is often in the frame of the tool: if it is, set log.force.frame to tool, "
+            "log.columns.orientation to the columns of the angles, and log.force.rotation to their axes"
         )
     if units["position"] != "m" and "velocity" in found:
         units["velocity"] = f"{units['position']}/s"
@@ -100,15 +102,37 @@ def _guessed_log(files: Sequence[Path]) -> tuple[dict[str, Any], list[str]]:
     return log | ({"units": changed} if changed else {}), remarks
 
 
+def _candidates(opened: Opened) -> list[str]:
+    """Names that may be of use: messages have times of their own, and joints no place in space."""
+    names = [name for table in opened.tables for name in table.columns]
+    if opened.tables[0].timed:
+        names = [
+            name for name in names if ".header." not in name and "joint" not in name.split(".")[0].lower()
+        ]
+    return list(dict.fromkeys(names))
+
+
+def _defaults(opened: Opened, key: str) -> tuple[str, ...]:
+    """What opening the file found on its own, and need not be stated."""
+    return (str(getattr(opened.config.columns, key)),)
+
+
+def _nameless(table: Table) -> LogError:
+    return LogError(
+        f"{table.source}: expected names such as position_x, x or pos, found none that looks like a position; name the "
+        "columns in a configuration"
+    )
+
+
 #: Opens a file whether or not a column of time was found.
 _TIMELESS: Mapping[str, Any] = {"sampling_rate": PLACEHOLDER_RATE}
 
 
 def _relative(found: Mapping[str, str]) -> dict[str, str]:
     """Paths of arrays as they are within a recording: without the groups that position and force share."""
-    parents = [found[key].split("/")[:-1] for key in ("position", "force")]
-    if found["position"].startswith("/"):
+    if not {"position", "force"} <= found.keys() or found["position"].startswith("/"):
         return dict(found)
+    parents = [found[key].split("/")[:-1] for key in ("position", "force")]
     shared = 0
     while all(len(parent) > shared for parent in parents) and parents[0][shared] == parents[1][shared]:
         shared += 1

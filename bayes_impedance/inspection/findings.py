@@ -23,11 +23,13 @@ from bayes_impedance.recording.quality import (
 
 #: Samples of a recording that are looked at, from its middle: more tell nothing new.
 ENOUGH = 200_000
+#: A hand that moves less [m], or for a shorter time [s], does nothing to learn from.
+LEAST_REACH, SHORTEST = 1e-3, 1.0
 
 
 @dataclass(frozen=True)
-class TimeStamps:
-    """What is wrong with the time stamps of a stream."""
+class Remark:
+    """Something that looks wrong and has no number."""
 
     sentence: str
 
@@ -99,7 +101,19 @@ def _of_motion(samples: Samples, axes: Sequence[str]) -> Iterator[Finding]:
 
 
 def _of_trial(reading: Reading) -> Iterator[Finding]:
-    """Sign of the force, and force at rest, in the first trial."""
+    """Trials without motion or duration; sign of the force, and force at rest, in the first."""
+    for trial in reading.trials:
+        reach = float(np.ptp(trial.position, axis=0).max())
+        if reach < LEAST_REACH:
+            yield Remark(
+                f"{trial.source}, trial {trial.name}: the hand moves by {1e3 * reach:.2g} mm; leave the trial out, or "
+                "check log.units.position"
+            )
+        if np.ptp(trial.time) < SHORTEST:
+            yield Remark(
+                f"{trial.source}, trial {trial.name}: {trial.n_samples} samples in {np.ptp(trial.time):.2g} s are too "
+                "few to learn from; leave the trial out, or check log.units.time"
+            )
     for trial in reading.trials[:1]:
         if trial.force is None or trial.n_samples < 10:
             continue
@@ -123,14 +137,12 @@ def of_clock(name: str, clock: ClockReport) -> Iterator[Finding]:
     if clock.gaps:
         start, longest = max(clock.gaps, key=lambda gap: gap[1])
         count = f"{len(clock.gaps)} gap{'s' if len(clock.gaps) > 1 else ''}"
-        yield TimeStamps(
-            f"{name}: {count} in the time stamps, the longest of {longest:.3g} s at {start:.6g} s"
-        )
+        yield Remark(f"{name}: {count} in the time stamps, the longest of {longest:.3g} s at {start:.6g} s")
     if clock.duplicates:
-        yield TimeStamps(
+        yield Remark(
             f"{name}: {clock.duplicates} time stamps equal to the one before; set log.clock.duplicates=drop"
         )
     if clock.backwards:
-        yield TimeStamps(f"{name}: {clock.backwards} time stamps earlier than the one before")
+        yield Remark(f"{name}: {clock.backwards} time stamps earlier than the one before")
     if clock.source == "record":
-        yield TimeStamps(f"{name}: times are those of arrival, for {clock.why}")
+        yield Remark(f"{name}: times are those of arrival, for {clock.why}")

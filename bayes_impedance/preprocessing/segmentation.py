@@ -61,15 +61,16 @@ def _without_gaps(trial: Trial, config: PreprocessingConfig, left_out: list[str]
     longest = int(np.argmax(steps))
     # Relative slack: differences of time stamps carry rounding errors.
     gaps = np.flatnonzero(steps > config.max_gap * (1 + 1e-9)) + 1
-    if not len(gaps):
+    shortest = config.segmentation.minimum_duration
+    splits = config.segmentation.gaps == "split"
+    if not len(gaps) and (not splits or np.ptp(trial.time) >= shortest):
         return [trial]
     found = f"{steps[longest]:g} s from {trial.time[longest]:g} to {trial.time[longest + 1]:g} s"
-    if config.segmentation.gaps == "refuse":
+    if not splits:
         raise LogError(
             f"{place(trial)}: expected steps of at most {config.max_gap:g} s, found a gap of {found}; cut there with "
             "log.window, or raise preprocessing.max_gap, or let preprocessing.segmentation.gaps=split make trials of it"
         )
-    shortest = config.segmentation.minimum_duration
     edges = [0, *gaps.tolist(), trial.n_samples]
     parts = [slice(start, end) for start, end in pairwise(edges)]
     durations = [float(np.ptp(trial.time[part])) for part in parts]

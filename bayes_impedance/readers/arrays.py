@@ -7,6 +7,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -49,7 +50,7 @@ def open_arrays(tree: Tree, source: str, config: LogConfig, expected: str) -> Op
     """A table for each recording in a tree of arrays; `expected` names the format.
 
     Raises:
-        LogError: there is no array, nothing at `log.root`, or no position.
+        LogError: there is no array, or nothing at `log.root`.
     """
     if not any(True for _ in leaves(tree)):
         raise LogError(
@@ -61,10 +62,13 @@ def open_arrays(tree: Tree, source: str, config: LogConfig, expected: str) -> Op
             f"{source}: expected a group or struct {config.root!r}, found {_listed(tree)}; mend log.root"
         )
     keyed = recordings(root, config)
-    if not keyed:
-        raise _positionless(root, source, config)
-    whole = config.root.strip("/").split("/")[-1] if config.root else None
     budget: dict[str | None, int] = {}
+    if not keyed:
+        # Whoever inspects the file wants to see what it holds all the same.
+        table = _table(root, None, source, config, expected, budget)
+        lacking = {"position": _positionless(root, source, config)}
+        return Opened((replace(table, absent=lacking),), config)
+    whole = config.root.strip("/").split("/")[-1] if config.root else None
     return Opened(
         tuple(
             _table(branch, key or whole, source, config, expected, budget) for key, branch in keyed.items()

@@ -66,16 +66,6 @@ def open_files(files: Sequence[Path], config: LogConfig) -> Iterator[Opened]:
         yield open_file(file, source, config)
 
 
-def column_names(file: Path) -> tuple[str, ...]:
-    """Names of everything in a file, whatever a configuration calls its columns.
-
-    Raises:
-        LogError: as `open_file` does.
-    """
-    (opened,) = open_files([file], LogConfig())
-    return tuple(dict.fromkeys(name for table in opened.tables for name in table.columns))
-
-
 def read_tables(opened: Opened, require_force: bool = True) -> list[Reading]:
     """The recordings of a file, read.
 
