@@ -181,9 +181,11 @@ def _over_time(
 def plot_recording(log: InteractionLog, prepared: PreparedLog | None) -> Figure:
     """Position, force and speed over time as logged, what the model sees of them on top, and the path."""
     figure = Figure(figsize=(11.0, 7.5), layout="constrained")
-    panels = figure.subplot_mosaic(
-        [["position", "path"], ["force", "path"], ["speed", "phase"]], width_ratios=[2, 1]
-    )
+    phased = prepared is not None and any(trial.phase is not None for trial in prepared.trials)
+    # A letter a panel: of nested lists the types cannot be told.
+    letters = {"a": "position", "b": "force", "c": "speed", "d": "path", "e": "phase"}
+    mosaic = figure.subplot_mosaic("ad;bd;ce" if phased else "ad;bd;cd", width_ratios=[2, 1])
+    panels = {letters[letter]: panel for letter, panel in mosaic.items()}
     start = 0.0
     for trial in log.trials:
         _draw_trial(panels, trial, log.axes, start)
@@ -194,15 +196,13 @@ def plot_recording(log: InteractionLog, prepared: PreparedLog | None) -> Figure:
     for name, label in (("position", "position [m]"), ("force", "force [N]"), ("speed", "speed [m/s]")):
         _label(panels[name], 0, 0 if name != "speed" else 2, 3, label, "time, trials in a row [s]")
     _label(panels["path"], 0, 0, 1, f"{log.axes[min(1, len(log.axes) - 1)]} [m]", f"{log.axes[0]} [m]")
-    _label(panels["phase"], 0, 0, 1, "phase", "time in the repetition [s]")
+    if phased:
+        _label(panels["phase"], 0, 0, 1, "phase", "time in the repetition [s]")
     if len(log.axes) > 1:
         panels["path"].set_aspect("equal", adjustable="datalim")
-    handles = [
-        Line2D([], [], color=colour, label=label)
-        for colour, label in zip(
-            (*AXIS_COLOURS[: len(log.axes)], POSTERIOR), (*log.axes, "the model sees"), strict=True
-        )
-    ]
+    colours = (*AXIS_COLOURS[: len(log.axes)], POSTERIOR)
+    named = zip((*log.axes, "what the model sees"), colours, strict=True)
+    handles = [Line2D([], [], color=colour, label=label) for label, colour in named]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=8, frameon=False)
     figure.suptitle(", ".join(dict.fromkeys(trial.source for trial in log.trials)), fontsize=11)
     return figure

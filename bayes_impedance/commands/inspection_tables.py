@@ -13,6 +13,7 @@ from rich.table import Table
 from bayes_impedance.inspection.inspect import Inspection
 from bayes_impedance.log import InteractionLog
 from bayes_impedance.preprocessing import PreparedLog
+from bayes_impedance.recording.clock import ONLY_CLOCK, ClockReport
 from bayes_impedance.recording.device_law import DeviceLaw
 
 #: Trials and topics beyond this many are counted and not listed.
@@ -33,7 +34,7 @@ def print_inspection(console: Console, inspection: Inspection) -> None:
     if inspection.smoothing:
         console.print(_smoother_table(inspection))
     if inspection.law is not None and inspection.log is not None:
-        console.print(_law_table(inspection.law, inspection.log.axes))
+        _print_law(console, inspection.law, inspection.log.axes)
     _print_sentences(console, "Force", _of_force(inspection))
     _print_sentences(console, "Mended on reading", inspection.repairs, "yellow")
     wrong = [finding.sentence for finding in inspection.findings]
@@ -95,10 +96,15 @@ def _clock_table(inspection: Inspection) -> Table:
         compared = "" if offset is None else f", {offset.offset:+.3f} s, {offset.drift:+.0f} ppm"
         table.add_row(
             escape(name), str(clock.n), f"{clock.span:.2f}", f"{clock.rate:.4g}", f"{1e3 * clock.jitter:.2g}",
-            str(len(clock.gaps)), str(clock.duplicates), clock.source + compared,
+            str(len(clock.gaps)), str(clock.duplicates), _clock_name(clock) + compared,
         )  # fmt: skip
     _count_rest(table, len(inspection.clocks))
     return table
+
+
+def _clock_name(clock: ClockReport) -> str:
+    # Two names for one clock would only puzzle.
+    return "one" if clock.why == ONLY_CLOCK else clock.source
 
 
 def _count_rest(table: Table, count: int) -> None:
@@ -161,17 +167,22 @@ def _smoother_table(inspection: Inspection) -> Table:
     return table
 
 
-def _law_table(law: DeviceLaw, axes: Sequence[str]) -> Table:
-    """Virtual mass and damping of the robot, an axis a row."""
+def _print_law(console: Console, law: DeviceLaw, axes: Sequence[str]) -> None:
+    """Virtual mass and damping of the robot, an axis a row; a sentence where it has none."""
+    if law.pooled < LEAST_SHARE:
+        console.print(
+            f"The robot does not answer force by a mass and a damping: R² of u + p = M a + B v is {law.pooled:.2f} "
+            "over all axes",
+            highlight=False,
+        )
+        return
     table = _table("The robot's law, u + p = M a + B v", "axis", "M [kg]", "B [Ns/m]", "R²")
     for a, axis in enumerate(axes):
         mass = f"{law.mass[a]:.3g} ± {law.mass_error[a]:.2g}" if law.mass_determined[a] else "not determined"
-        table.add_row(
-            axis, mass, f"{law.damping[a]:.4g} ± {law.damping_error[a]:.2g}", f"{law.r_squared[a]:.2f}"
-        )
-    answers = "" if law.pooled >= LEAST_SHARE else ": this robot does not answer force by such a law"
-    table.caption = f"R² over all axes: {law.pooled:.3f}{answers}"
-    return table
+        damping = f"{law.damping[a]:.4g} ± {law.damping_error[a]:.2g}"
+        table.add_row(axis, mass, damping, f"{law.r_squared[a]:.2f}")
+    table.caption = f"R² over all axes: {law.pooled:.3f}"
+    console.print(table)
 
 
 def _of_force(inspection: Inspection) -> list[str]:

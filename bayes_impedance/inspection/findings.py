@@ -60,6 +60,29 @@ def look_at(reading: Reading) -> list[Finding]:
     return found
 
 
+@dataclass(frozen=True)
+class Repeated:
+    """What looks wrong with one channel in `count` recordings; `first` as it is in one of them."""
+
+    first: Finding
+    count: int
+
+    @property
+    def sentence(self) -> str:
+        """That of the first, and in how many others."""
+        return f"{self.first.sentence} ({self.count} recordings)"
+
+
+def gathered(by_recording: Sequence[Sequence[Finding]]) -> list[Finding]:
+    """Findings of several recordings, of one kind and channel only once."""
+    alike: dict[tuple[type, str], list[Finding]] = {}
+    for findings in by_recording:
+        for finding in findings:
+            channel = getattr(finding, "channel", None) or finding.sentence
+            alike.setdefault((type(finding), channel), []).append(finding)
+    return [own[0] if len(own) == 1 else Repeated(own[0], len(own)) for own in alike.values()]
+
+
 def middle_of(samples: Samples) -> Samples:
     """At most ENOUGH samples, from the middle."""
     surplus = max(0, len(samples.time) - ENOUGH)

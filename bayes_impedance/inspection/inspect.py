@@ -10,7 +10,7 @@ from pathlib import Path
 
 from bayes_impedance.config import ClockConfig, Config, Smoother
 from bayes_impedance.errors import BayesImpedanceError, BayesImpedanceWarning, LogError
-from bayes_impedance.inspection.findings import ENOUGH, look_at, of_clock
+from bayes_impedance.inspection.findings import ENOUGH, gathered, look_at, of_clock
 from bayes_impedance.log import InteractionLog, Trial
 from bayes_impedance.preprocessing import PreparedLog, prepare
 from bayes_impedance.preprocessing.bandwidth import SmootherEffect, smoother_effect
@@ -71,11 +71,11 @@ def inspect_recordings(files: Sequence[Path], config: Config) -> Inspection:
             return replace(result, refusal=str(error), repairs=tuple(repairs))
     clocks = _clocks(readings)
     found = [finding for name, clock in clocks.items() for finding in of_clock(name, clock)]
-    found += [finding for reading in readings for finding in look_at(reading)]
+    found += gathered([look_at(reading) for reading in readings])
     result = replace(
         result,
         log=log,
-        findings=tuple({finding.sentence: finding for finding in found}.values()),
+        findings=tuple(found),
         clocks=clocks,
         law=_law(log),
         lag=_lag(log),
@@ -113,15 +113,19 @@ def _clocks(readings: Sequence[Reading]) -> dict[str, ClockReport]:
     for reading in readings:
         clocks |= {f"{reading.source}, {name}": clock for name, clock in reading.sensed.clocks.items()}
         if not reading.sensed.clocks:
+            labels = reading.sensed.labels.get("trial")
             for trial in reading.trials:
                 where = f"{reading.source}, trial {trial.name}"
+                # As logged: samples with equal stamps are no longer in the trial.
+                own = slice(None) if labels is None else labels == trial.name
                 try:
-                    clocks[where] = choose_clock(
-                        trial.time, None, ClockConfig(duplicates="drop"), where
-                    ).report
+                    clock = choose_clock(
+                        reading.sensed.time[own], None, ClockConfig(duplicates="drop"), where
+                    )
                 except LogError:
                     # Time that goes back is refused where the trial is checked.
                     continue
+                clocks[where] = clock.report
     return clocks
 
 

@@ -13,6 +13,8 @@ from bayes_impedance.errors import LogError
 from bayes_impedance.log import Array, Integers
 from bayes_impedance.recording.offset import RECORDER, ClockOffset, compare_clocks
 
+#: Why a clock is taken that has no rival.
+ONLY_CLOCK = "the only clock there is"
 #: A step longer than this many medians is a gap: at least two messages in a row are missing.
 GAP = 2.5
 #: No two clocks of computers differ by more in their rate [ppm]: quartz keeps 100, the network corrects by up to 500.
@@ -124,7 +126,7 @@ def _doubt(sent: Array) -> str:
 def _choose(doubt: str, both: bool, config: ClockConfig) -> tuple[Literal["header", "record"], str]:
     """Which clock, and why."""
     if not both:
-        return "header", "the only clock there is"
+        return "header", ONLY_CLOCK
     if config.source != "auto":
         return config.source, "log.clock.source says so"
     if doubt:
