@@ -52,7 +52,7 @@ class Layout:
     lengths: Mapping[int, int]
 
     def columns(self) -> Iterator[str]:
-        """Every number by its name, such as `wrench.force.x` or `effort[0]`."""
+        """Every number by its name, such as wrench.force.x or effort[0]."""
         for path, field in self.fields.items():
             if field.count is None:
                 yield path

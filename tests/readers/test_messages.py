@@ -438,11 +438,12 @@ def peak_of(file):
         tracemalloc.stop()
 
 
-def test_chunk_longer_than_the_file_takes_no_memory_in_ros1(tmp_path):
+@pytest.mark.parametrize("where", ["record", "chunk"])
+def test_length_beyond_the_file_takes_no_memory_in_ros1(tmp_path, where):
     file = write_bag(tmp_path / "log.bag", hidden())
     raw = bytearray(file.read_bytes())
-    # The header of the chunk ends with its size, then comes the length of its data.
-    at = raw.index(b"size=") + len(b"size=") + 4
+    # The first record begins after a line of text; the header of a chunk ends with its size, its data begin with it.
+    at = raw.index(b"\n") + 1 if where == "record" else raw.index(b"size=") + len(b"size=") + 4
     raw[at : at + 4] = (2**31).to_bytes(4, "little")
     file.write_bytes(raw)
     assert peak_of(file) < ROOM
@@ -500,6 +501,29 @@ def test_array_of_two_billion_numbers_takes_no_memory(tmp_path):
         assert raw.count(six) >= 2
         file.write_bytes(raw.replace(six, (2**31).to_bytes(4, "little")))
         assert peak_of(file) < ROOM
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("wanted", ["/image.height", "/pose.pose.position.x"])
+def test_messages_are_not_held(tmp_path, ending, wanted):
+    image = {"height": 7, "data": np.zeros(200_000, dtype=np.uint8)}
+    messages = [
+        message
+        for i in range(200)
+        for message in (
+            ("/image", "sensor_msgs/msg/Image", START + i, image),
+            pose("/pose", START + i, (7, 8, 9)),
+        )
+    ]
+    file = write_bag(tmp_path / f"log{ending}", messages)
+    load(file, [wanted])
+    tracemalloc.start()
+    (stream,) = load(file, [wanted]).values()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert (stream.columns[wanted] == 7).all()
+    # Of 40 MB a batch, joined, and a chunk.
+    assert peak < 15e6
 
 
 # --- real recordings -----------------------------------------------------------------------------
