@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from lz4.frame import LZ4FrameDecompressor
 from rosbags.rosbag1 import reader as rosbag1
@@ -18,7 +19,7 @@ LARGEST_CHUNK = 1 << 28
 STEP = 1 << 20
 
 
-class BoundedFile(io.BufferedReader):
+class _BoundedFile(io.BufferedReader):
     """A file of which no more is read than there is: Python reserves what it is asked for, before it reads."""
 
     def __init__(self, path: Path) -> None:
@@ -32,11 +33,15 @@ class BoundedFile(io.BufferedReader):
 
 
 class BoundedPath(type(Path())):  # type: ignore[misc]
-    """A path, and the paths within it, that open as a `BoundedFile`."""
+    """A path, and the paths within it, of whose files no more is read than there is."""
 
     def open(self, mode: str = "r", *arguments: Any, **options: Any) -> Any:
         """As `Path.open`."""
-        return BoundedFile(self) if mode == "rb" else super().open(mode, *arguments, **options)
+        return _BoundedFile(self) if mode == "rb" else super().open(mode, *arguments, **options)
+
+    def __format__(self, _: str) -> str:
+        """As in a URI, which rosbags makes of it to open SQLite; there # and ? would end the path."""
+        return quote(str(self))
 
 
 def unpack(decompressor: Any, data: bytes) -> bytes:

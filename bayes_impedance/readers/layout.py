@@ -44,15 +44,17 @@ class Field:
 
 @dataclass(frozen=True)
 class Layout:
-    """Offsets of the fields in all messages of `size` bytes that have the same `lengths` of strings and arrays."""
+    """Offsets of the fields in all messages of one size that have the same lengths of strings and arrays.
 
-    size: int
+    `lengths`: where those stand, and the bytes that each takes.
+    """
+
     fields: Mapping[str, Field]
     texts: Mapping[str, slice]
     lengths: Mapping[int, int]
 
     def columns(self) -> Iterator[str]:
-        """Every number by its name, such as `wrench.force.x` or `effort[0]`."""
+        """Every number by its name, such as wrench.force.x or effort[0]."""
         for path, field in self.fields.items():
             if field.count is None:
                 yield path
@@ -110,7 +112,7 @@ class Walker:
         # CDR may be padded to a multiple of four.
         if not 0 <= len(self.raw) - self.at <= (3 if self.cdr else 0):
             raise MalformedError(f"{len(self.raw)} bytes where {self.at} make up the message")
-        return Layout(len(self.raw), self.fields, self.texts, self.lengths)
+        return Layout(self.fields, self.texts, self.lengths)
 
     def _message(self, path: str, kind: str) -> None:
         if kind not in self.definitions:

@@ -25,7 +25,7 @@ STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 
 
 def open_messages(file: Path, source: str, config: LogConfig) -> Opened:
-    """A bag: every number in a message is a column `TOPIC.FIELD`, such as /ft.wrench.force.x.
+    """A bag: every number in a message is a column, such as /ft.wrench.force.x.
 
     Raises:
         LogError: it is damaged, or holds no topic that is named or sought.

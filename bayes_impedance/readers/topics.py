@@ -39,12 +39,12 @@ PLACES: Mapping[str, Mapping[str, str]] = {
 SOUGHT = ("position", "force", "velocity", "acceleration")
 REQUIRED = {
     "position": (
-        "a pose (PoseStamped, TransformStamped, Odometry), or a topic named in log.columns.position, such as "
-        '"/robot_state.position[{index}]"'
+        "a pose (PoseStamped, TransformStamped, Odometry, or one in a field that log.columns.position names, such as "
+        '"/robot_state.position[{index}]")'
     ),
     "force": (
-        "a wrench (WrenchStamped), or one hidden in the effort of a JointState and named in log.columns.force, "
-        'such as "/robot_state.effort[{index}]"'
+        "a wrench (WrenchStamped, or one in the effort of a JointState that log.columns.force names, such as "
+        '"/robot_state.effort[{index}]")'
     ),
 }
 

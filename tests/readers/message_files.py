@@ -11,9 +11,13 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
+from bayes_impedance.config import LogConfig
+
 ENDINGS = (".bag", ".db3", ".mcap")
 #: Topic, type, time of arrival [ns], content.
 Message = tuple[str, str, int, Mapping[str, Any]]
+
+START = 1_700_000_000_123_456_789
 
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
@@ -136,3 +140,15 @@ def odometry(
         "twist": {"twist": {"linear": vector(velocity)}},
     }
     return topic, "nav_msgs/msg/Odometry", time, content
+
+
+#: Reads what `hidden` gives.
+HIDDEN = LogConfig.model_validate(
+    {"columns": {"position": "/robot_state.position[{index}]", "force": "/robot_state.effort[{index}]"}}
+)
+
+
+def hidden(n: int = 20) -> list[Message]:
+    """A JointState with position and, as effort, force."""
+    rng = np.random.default_rng(3)
+    return [joint_state("/robot_state", START + 10_000_000 * i, *rng.normal(size=(2, 6))) for i in range(n)]

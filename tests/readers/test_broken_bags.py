@@ -8,17 +8,13 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from message_files import joint_state, pose, wrench, write_bag
+from message_files import HIDDEN, START, joint_state, pose, wrench, write_bag
 
 from bayes_impedance.config import LogConfig
 from bayes_impedance.errors import BayesImpedanceWarning, LogError
 from bayes_impedance.readers import read_log
 from bayes_impedance.readers.read import open_file
 
-START = 1_700_000_000_000_000_000
-HIDDEN = LogConfig.model_validate(
-    {"columns": {"position": "/robot_state.position[{index}]", "force": "/robot_state.effort[{index}]"}}
-)
 #: What a damaged file of some kilobytes may take [byte].
 ROOM = 1 << 26
 FORMATS = {

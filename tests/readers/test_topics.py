@@ -125,8 +125,9 @@ def test_no_wrench_says_what_was_sought_and_what_there_is(tmp_path):
     file = write_bag(tmp_path / "log.bag", [POSE, joint_state("/joints", START, (1, 2))])
     with pytest.raises(
         LogError,
-        match=r"log.bag: expected a wrench \(WrenchStamped\), or one hidden in the effort of a JointState.* "
-        r'"/robot_state.effort\[\{index\}\]", found no such topic among /pose \(geometry_msgs/PoseStamped\), '
+        match=r"log.bag: expected a wrench \(WrenchStamped, or one in the effort of a JointState that "
+        r'log.columns.force names, such as "/robot_state.effort\[\{index\}\]"\), found no such topic among /pose '
+        r"\(geometry_msgs/PoseStamped\), "
         r"/joints \(sensor_msgs/JointState\); record what is missing",
     ):
         read_log(file)
