@@ -53,7 +53,7 @@ def open_arrays(tree: Tree, source: str, config: LogConfig, expected: str) -> Op
     """
     if not any(True for _ in leaves(tree)):
         raise LogError(
-            f"{source}: expected arrays of numbers, found none; save matrices, or structs or groups of them"
+            f"{source}: expected named arrays, found none; save matrices, or structs or groups of them"
         )
     root = at(tree, config.root or "")
     if not isinstance(root, dict):
@@ -212,7 +212,7 @@ def _positionless(tree: Tree, source: str, config: LogConfig) -> LogError:
 
 def _pickled(where: str, name: str) -> LogError:
     return LogError(
-        f"{where}: expected arrays of numbers or text, found Python objects in {name!r}, which are not read, for "
+        f"{where}: expected numbers or text, found Python objects in {name!r}, which are not read, for "
         "that would run code from the file; save plain arrays"
     )
 

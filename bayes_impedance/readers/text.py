@@ -124,6 +124,8 @@ def _blocks(file: Path) -> Iterator[bytes]:
         rest = stream.read(len(BYTE_ORDER_MARK)).removeprefix(BYTE_ORDER_MARK)
         while block := stream.read(PIECE):
             rest += block
+            if len(block) < PIECE:
+                break
             # A carriage return at the end may be the first half of a line's end.
             cut = max(rest.rfind(b"\n"), rest.rfind(b"\r", 0, len(rest) - 1)) + 1
             if cut:

@@ -136,7 +136,7 @@ def _samples_axis(shape: tuple[int, ...], lengths: set[int]) -> int | None:
     if 0 in shape:
         return shape.index(0)
     if shape[0] == shape[1]:
-        return None
+        return 0 if shape == (1, 1) else None
     timed = [axis for axis in (0, 1) if shape[axis] in lengths]
     return timed[0] if len(timed) == 1 else int(np.argmax(shape))
 
