@@ -158,7 +158,9 @@ def _resolves(tree: Tree, config: LogConfig) -> bool:
         name = of_axis(config.columns.position, axis)
         for path in (name, re.sub(r"\[\d+\]$", "", name)):
             leaf = at(tree, path)
-            if isinstance(leaf, Leaf) and name in _spread(path, leaf, lengths):
+            column = _spread(path, leaf, lengths).get(name) if isinstance(leaf, Leaf) else None
+            # A single number is a setting.
+            if column is not None and column.length != 1:
                 return True
     return False
 

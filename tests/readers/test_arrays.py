@@ -209,6 +209,15 @@ def test_the_outermost_recording_is_read_and_root_reaches_deeper(save):
     assert_equal(trial, inner)
 
 
+def test_a_single_number_is_no_recording(save):
+    path = save({"offset": {"position_x": 1.0, "position_y": 2.0}, "run": samples()})
+    columns = {"position": "position_{axis}", "force": "force[{index}]"}
+    with pytest.raises(
+        LogError, match=r"expected column 'position_x' in the file or in one of its groups, found"
+    ):
+        read_log(path, LogConfig.model_validate({"columns": columns}))
+
+
 @pytest.mark.parametrize("kind", [np.int8, np.uint8, np.int32, np.uint16, np.int64, np.float32, ">f8", ">i4"])
 def test_numbers_of_every_kind_become_float64(save, kind):
     recording = samples()

@@ -59,7 +59,7 @@ def test_text_of_every_kind_labels(path, dtype, options):
         fill(file)
         trial = file.create_dataset("trial", (N,), dtype=dtype, **options)
         labels = np.repeat([name.encode() for name in names], N // 2)
-        trial[:] = labels.astype(object) if trial.dtype.hasobject else labels.astype("S12")
+        trial[:] = labels.astype(trial.dtype)
         file["group"] = "Ada"
     log = read_log(path, CONFIG)
     assert [(trial.name, trial.group) for trial in log.trials] == [(name, "Ada") for name in names]
