@@ -164,10 +164,12 @@ def _cells(values: Values) -> pd.Series[Any]:
         # A copy, so that the block it comes from can go.
         return pd.Series(np.array(values, dtype=np.float64, order="C"))
     if values.dtype.kind in "SUO":
+        # Samples of one label share its text.
+        distinct, codes = np.unique(values, return_inverse=True)
         texts = [
-            value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value) for value in values
+            value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value) for value in distinct
         ]
-        return pd.Series(texts, dtype=object)
+        return pd.Series(np.array(texts, dtype=object)[codes])
     return pd.Series(values.copy())
 
 

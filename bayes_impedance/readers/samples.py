@@ -53,21 +53,21 @@ def read_samples(table: Table, wanted: Mapping[str, tuple[str, ...]], config: Lo
     inside = (time >= (-np.inf if start is None else start)) & (time < (np.inf if end is None else end))
     if not inside.any():
         raise LogError(
-            f"{table.source}: expected samples within log.window (start {start}, end {end} s), found none, for the "
+            f"{table.where}: expected samples within log.window (start {start}, end {end} s), found none, for the "
             f"file spans {time.min():g} to {time.max():g} s; change log.window"
         )
     rows = RowNumbers(stream.rows.word, stream.rows.numbers[inside])
     values = {
         key: _scale(key, config)
         * np.stack(
-            [numbers(rows, stream.columns[name][inside], table.source, key, name) for name in columns],
+            [numbers(rows, stream.columns[name][inside], table.where, key, name) for name in columns],
             axis=-1,
         )
         for key, columns in wanted.items()
         if key not in (*LABELS, *TIMES)
     }
     marks = {
-        key: labels(rows, stream.columns[wanted[key][0]][inside], table.source, key, wanted[key][0])
+        key: labels(rows, stream.columns[wanted[key][0]][inside], table.where, key, wanted[key][0])
         for key in LABELS
         if key in wanted
     }
@@ -81,7 +81,7 @@ def _time(stream: Stream, table: Table, wanted: Mapping[str, tuple[str, ...]], c
         assert config.sampling_rate is not None
         return np.arange(len(stream.rows.numbers)) / config.sampling_rate
     (name,) = wanted["time"]
-    return numbers(stream.rows, stream.columns[name], table.source, "time", name) * config.units.scale("time")
+    return numbers(stream.rows, stream.columns[name], table.where, "time", name) * config.units.scale("time")
 
 
 def _scale(key: str, config: LogConfig) -> float:

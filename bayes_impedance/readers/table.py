@@ -42,6 +42,11 @@ class Table:
     trial: str | None = None
     timed: bool = False
 
+    @property
+    def where(self) -> str:
+        """How errors name the recording."""
+        return self.source if self.trial is None else f"{self.source}, trial {self.trial!r}"
+
 
 @dataclass(frozen=True)
 class Opened:

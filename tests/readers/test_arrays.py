@@ -313,7 +313,9 @@ def test_refuses_complex_numbers(save):
 def test_refuses_a_number_that_is_missing(save):
     recordings = {"first": samples(), "second": samples(seed=1)}
     recordings["second"]["force"][[4, 9], 1] = np.nan
-    with pytest.raises(LogError, match=r"column 'force\[1\]': expected finite numbers, .* at rows 5, 10;"):
+    with pytest.raises(
+        LogError, match=r"trial 'second', column 'force\[1\]': expected finite numbers, .* at rows 5, 10;"
+    ):
         read_log(save(recordings), FLAT)
 
 
