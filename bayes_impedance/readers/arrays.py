@@ -54,7 +54,7 @@ def open_arrays(tree: Tree, source: str, config: LogConfig, expected: str) -> Op
     """
     if not any(True for _ in leaves(tree)):
         raise LogError(
-            f"{source}: expected arrays of numbers, found none; save matrices, or structs or groups of them"
+            f"{source}: expected named arrays, found none; save matrices, or structs or groups of them"
         )
     root = at(tree, config.root or "")
     if not isinstance(root, dict):
@@ -168,10 +168,12 @@ def _cells(values: Values) -> pd.Series[Any]:
         # A copy, so that the block it comes from can go.
         return pd.Series(np.array(values, dtype=np.float64, order="C"))
     if values.dtype.kind in "SUO":
+        # Samples of one label share its text.
+        distinct, codes = np.unique(values, return_inverse=True)
         texts = [
-            value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value) for value in values
+            value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value) for value in distinct
         ]
-        return pd.Series(texts, dtype=object)
+        return pd.Series(np.array(texts, dtype=object)[codes])
     return pd.Series(values.copy())
 
 
@@ -216,7 +218,7 @@ def _positionless(tree: Tree, source: str, config: LogConfig) -> LogError:
 
 def _pickled(where: str, name: str) -> LogError:
     return LogError(
-        f"{where}: expected arrays of numbers or text, found Python objects in {name!r}, which are not read, for "
+        f"{where}: expected numbers or text, found Python objects in {name!r}, which are not read, for "
         "that would run code from the file; save plain arrays"
     )
 

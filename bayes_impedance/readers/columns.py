@@ -69,7 +69,7 @@ def wanted_columns(
         for name in names:
             if table.columns.count(name) > 1:
                 raise LogError(
-                    f"{table.source}: expected one column {name!r}, found {table.columns.count(name)}; "
+                    f"{table.where}: expected one column {name!r}, found {table.columns.count(name)}; "
                     "rename the others"
                 )
     return wanted
@@ -111,7 +111,7 @@ def _question_half_axes(table: Table, columns: Columns, forceless: bool) -> None
         if not forceless:
             (present,) = set(names) - {key}
             warnings.warn(
-                f"{table.source}: axis {axis} has a column {names[present]!r} but none named {names[key]!r}, so it "
+                f"{table.where}: axis {axis} has a column {names[present]!r} but none named {names[key]!r}, so it "
                 "is left out; name the axes that are meant in log.axes",
                 LogWarning,
                 stacklevel=2,
@@ -130,7 +130,7 @@ def _missing(table: Table, key: str, name: str, optional: bool = False) -> LogEr
     near = difflib.get_close_matches(name.lower(), by_lower_case, n=1, cutoff=0.3)
     found = f"the nearest is {by_lower_case[near[0]]!r}" if near else f"there is {_listed(table.columns)}"
     return LogError(
-        f"{table.source}: expected column {name!r}, found none of that name ({found}); set log.columns.{key}"
+        f"{table.where}: expected column {name!r}, found none of that name ({found}); set log.columns.{key}"
         f"{' to null or' if optional else ''} to the name in the file"
     )
 

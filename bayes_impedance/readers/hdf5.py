@@ -109,9 +109,11 @@ def _check_texts(file: Path, dataset: h5py.Dataset) -> None:
 
 def _check_heap(data: mmap.mmap, start: int) -> None:
     at, end = start + 16, start + int.from_bytes(data[start + 8 : start + 16], "little")
-    while at + 16 <= end:
+    damaged = end > len(data)
+    while at + 16 <= end and not damaged:
         index, size = data[at : at + 2], int.from_bytes(data[at + 8 : at + 16], "little")
         # Object 0 is the free space, whose size includes its head.
         at += size if index == b"\0\0" else 16 + -(-size // 8) * 8
-        if at > end or (index == b"\0\0" and size < 16):
-            raise ValueError("the sizes of its texts are damaged")
+        damaged = at > end or (index == b"\0\0" and size < 16)
+    if damaged:
+        raise ValueError("the sizes of its texts are damaged")

@@ -88,7 +88,7 @@ def _parts(table: Table, streams: Sequence[Stream], wanted: Mapping[str, tuple[s
         own = {i for name in columns for i, stream in enumerate(streams) if name in stream.columns}
         if len(own) > 1:
             raise LogError(
-                f"{table.source}: expected the columns of {key} at the same times, found {', '.join(columns)} in "
+                f"{table.where}: expected the columns of {key} at the same times, found {', '.join(columns)} in "
                 f"{', '.join(streams[i].name for i in sorted(own))}; name columns of one of them in log.columns.{key}"
             )
         clock = "force_time" if key in OF_THE_SENSOR and "force_time" in wanted else "time"
@@ -101,7 +101,7 @@ def _parts(table: Table, streams: Sequence[Stream], wanted: Mapping[str, tuple[s
     apart = [key for part in found[1:] for key in part.keys if key in (*LABELS, "phase")]
     if apart:
         raise LogError(
-            f"{table.source}: expected {apart[0]} at the times of position, found it elsewhere; write it beside "
+            f"{table.where}: expected {apart[0]} at the times of position, found it elsewhere; write it beside "
             f"position, or set log.columns.{apart[0]} to null"
         )
     return found
@@ -120,17 +120,17 @@ def _time(
     (name,) = wanted[clock]
     if name not in stream.columns:
         raise LogError(
-            f"{table.source}: expected as many values in {name!r} as in the columns that it times, found another "
+            f"{table.where}: expected as many values in {name!r} as in the columns that it times, found another "
             f"number; name their time stamps in log.columns.{clock}"
         )
-    return numbers(stream.rows, stream.columns[name], table.source, clock, name) * config.units.scale("time")
+    return numbers(stream.rows, stream.columns[name], table.where, clock, name) * config.units.scale("time")
 
 
 def _clock(
     table: Table, part: _Part, wanted: Mapping[str, tuple[str, ...]], config: LogConfig
 ) -> StreamClock:
     stream = part.stream
-    place = f"{table.source}, {part.name}"
+    place = f"{table.where}, {part.name}"
     if stream.sent is not None:
         return choose_clock(stream.sent, stream.received, config.clock, place)
     if stream.received is not None:
@@ -145,7 +145,7 @@ def _window(table: Table, time: Array, config: LogConfig) -> npt.NDArray[np.bool
     )
     if not inside.any():
         raise LogError(
-            f"{table.source}: expected samples within log.window (start {start}, end {end} s), found none, for the "
+            f"{table.where}: expected samples within log.window (start {start}, end {end} s), found none, for the "
             f"file spans {time.min():g} to {time.max():g} s; change log.window"
         )
     return inside
@@ -167,14 +167,14 @@ def _values(
     values = {
         key: _scale(key, config)
         * np.stack(
-            [numbers(rows, stream.columns[name][which], table.source, key, name) for name in wanted[key]],
+            [numbers(rows, stream.columns[name][which], table.where, key, name) for name in wanted[key]],
             axis=-1,
         )
         for key in part.keys
         if key not in LABELS
     }
     marks = {
-        key: labels(rows, stream.columns[wanted[key][0]][which], table.source, key, wanted[key][0])
+        key: labels(rows, stream.columns[wanted[key][0]][which], table.where, key, wanted[key][0])
         for key in part.keys
         if key in LABELS
     }
@@ -235,12 +235,12 @@ def _merged(
         on_one_clock.Stream(base.part.name, time, index, None, base.clock.against_recorder),
         streams,
         align=config.clock.align,
-        place=table.source,
+        place=table.where,
     )
     for name, count in result.left_out.items():
         if count:
             warnings.warn(
-                f"{table.source}: {count} samples of {base.part.name} lie in gaps of {name} and are left out",
+                f"{table.where}: {count} samples of {base.part.name} lie in gaps of {name} and are left out",
                 LogWarning,
                 stacklevel=2,
             )

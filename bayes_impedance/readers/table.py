@@ -45,6 +45,11 @@ class Table:
     timed: bool = False
     absent: Mapping[str, LogError] = field(default_factory=dict)
 
+    @property
+    def where(self) -> str:
+        """How errors name the recording."""
+        return self.source if self.trial is None else f"{self.source}, trial {self.trial!r}"
+
 
 @dataclass(frozen=True)
 class Opened:

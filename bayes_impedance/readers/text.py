@@ -69,7 +69,9 @@ def open_text(file: Path, source: str, config: LogConfig) -> Opened:
                 numbers.append(lines.numbers)
                 frame = _parsed(lines, delimiter, header, names, labels)
                 for name in names:
-                    parts[name].append(frame[str(header.index(name))])
+                    cells = frame[str(header.index(name))]
+                    # A label stands in thousands of lines.
+                    parts[name].append(cells.astype("category") if name in labels else cells)
         # Piece by piece given up as the columns grow.
         columns = {name: _joined(parts.pop(name)) for name in names}
         return [Stream("", columns, RowNumbers("line", np.concatenate(numbers)))]
@@ -124,6 +126,8 @@ def _blocks(file: Path) -> Iterator[bytes]:
         rest = stream.read(len(BYTE_ORDER_MARK)).removeprefix(BYTE_ORDER_MARK)
         while block := stream.read(PIECE):
             rest += block
+            if len(block) < PIECE:
+                break
             # A carriage return at the end may be the first half of a line's end.
             cut = max(rest.rfind(b"\n"), rest.rfind(b"\r", 0, len(rest) - 1)) + 1
             if cut:
@@ -167,7 +171,7 @@ def _parsed(
         names=[str(index) for index in range(len(header))],
         usecols=list(at.values()),
         index_col=False,
-        dtype={at[name]: "category" for name in names if name in labels},
+        dtype={at[name]: str for name in names if name in labels},
         na_values={at[name]: list(MISSING) for name in names if name not in labels},
         keep_default_na=False,
         skip_blank_lines=False,
@@ -180,7 +184,7 @@ def _parsed(
 def _joined(parts: list[pd.Series[Any]]) -> pd.Series[Any]:
     """One column of its pieces: numbers where all are, else as if all had been read as text."""
     if isinstance(parts[0].dtype, pd.CategoricalDtype):
-        return pd.Series(union_categoricals([part.cat.as_unordered() for part in parts]))
+        return pd.Series(union_categoricals(parts))
     kinds = {part.dtype.kind for part in parts}
     if kinds <= set("iuf"):
         return pd.Series(np.concatenate([part.to_numpy(dtype=np.float64) for part in parts]))

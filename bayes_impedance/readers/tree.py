@@ -136,7 +136,7 @@ def _samples_axis(shape: tuple[int, ...], lengths: set[int]) -> int | None:
     if 0 in shape:
         return shape.index(0)
     if shape[0] == shape[1]:
-        return None
+        return 0 if shape == (1, 1) else None
     timed = [axis for axis in (0, 1) if shape[axis] in lengths]
     return timed[0] if len(timed) == 1 else int(np.argmax(shape))
 
@@ -158,7 +158,9 @@ def _resolves(tree: Tree, config: LogConfig) -> bool:
         name = of_axis(config.columns.position, axis)
         for path in (name, re.sub(r"\[\d+\]$", "", name)):
             leaf = at(tree, path)
-            if isinstance(leaf, Leaf) and name in _spread(path, leaf, lengths):
+            column = _spread(path, leaf, lengths).get(name) if isinstance(leaf, Leaf) else None
+            # A single number is a setting.
+            if column is not None and column.length != 1:
                 return True
     return False
 
