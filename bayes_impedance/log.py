@@ -285,7 +285,15 @@ def trial_arrays(trial: Any) -> dict[str, npt.NDArray[Any]]:
 
 
 def read_only(values: npt.ArrayLike, dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-    """C-contiguous copy that cannot be written to."""
+    """C-contiguous array that cannot be written to: a copy, unless `values` is one already and no view of another."""
+    if (
+        isinstance(values, np.ndarray)
+        and values.dtype == dtype
+        and values.base is None
+        and values.flags.c_contiguous
+        and not values.flags.writeable
+    ):
+        return values
     array = np.array(values, dtype=dtype, order="C", copy=True)
     array.setflags(write=False)
     return array

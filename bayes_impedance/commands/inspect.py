@@ -10,7 +10,6 @@ from rich.console import Console
 
 from bayes_impedance.commands.inspection_tables import print_inspection
 from bayes_impedance.config import load_config, shipped_configurations
-from bayes_impedance.errors import LogError
 from bayes_impedance.inspection.draft import draft
 from bayes_impedance.inspection.inspect import inspect_recordings
 from bayes_impedance.outputs import check_writable, whole_file
@@ -74,4 +73,4 @@ def inspect_command(
         save_figure(plot_recording(inspection.log, inspection.prepared), figure)
         console.print(f"wrote {figure}", highlight=False, soft_wrap=True)
     if inspection.refusal is not None:
-        raise LogError(inspection.refusal)
+        raise inspection.refusal

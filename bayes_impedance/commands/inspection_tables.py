@@ -188,9 +188,9 @@ def _print_law(console: Console, law: DeviceLaw, axes: Sequence[str]) -> None:
 def _of_force(inspection: Inspection) -> list[str]:
     """The tool and the lag."""
     sentences = [
-        f"{reading.source}: {reading.preparation.tool.sentence}"
-        for reading in inspection.readings
-        if reading.preparation.tool is not None
+        f"{source}: {preparation.tool.sentence}"
+        for source, preparation in inspection.preparations.items()
+        if preparation.tool is not None
     ]
     lag = inspection.lag
     if lag is not None:

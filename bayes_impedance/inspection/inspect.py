@@ -14,8 +14,9 @@ from bayes_impedance.inspection.findings import ENOUGH, gathered, look_at, of_cl
 from bayes_impedance.log import InteractionLog, Trial
 from bayes_impedance.preprocessing import PreparedLog, prepare
 from bayes_impedance.preprocessing.bandwidth import SmootherEffect, smoother_effect
+from bayes_impedance.readers.force import Preparation
 from bayes_impedance.readers.read import as_log, open_files, read_tables
-from bayes_impedance.readers.table import Table
+from bayes_impedance.readers.table import Opened, Table
 from bayes_impedance.readers.trials import Reading
 from bayes_impedance.recording.clock import ClockReport, choose_clock
 from bayes_impedance.recording.device_law import DeviceLaw, fit_device_law
@@ -28,17 +29,17 @@ WINDOWS = (0.5, 1.0, 2.0)
 
 @dataclass(frozen=True)
 class Inspection:
-    """What is in some recordings. Later parts are None where `refusal`, a sentence, says why they cannot be had.
+    """What is in some recordings. Later parts are None where `refusal` says why they cannot be had.
 
-    `tables`: what each file holds; `readings`: what was read of it; `log` and `prepared`: what the model would see;
-    `findings`: what looks wrong; `repairs`: what reading mended on its own; `clocks` by trial or topic; `smoothing`:
-    the window that is configured beside others; `law`: the robot's virtual mass and damping; `lag` of force behind
-    motion.
+    `tables`: what each file holds; `preparations`: tool and lag that reading found, by file; `log` and `prepared`: what
+    the model would see; `findings`: what looks wrong; `repairs`: what reading mended on its own; `clocks` by trial or
+    topic; `smoothing`: the window that is configured beside others; `law`: the robot's virtual mass and damping; `lag`
+    of force behind motion.
     """
 
     config: Config
     tables: tuple[Table, ...]
-    readings: tuple[Reading, ...] = ()
+    preparations: Mapping[str, Preparation] = field(default_factory=dict)
     log: InteractionLog | None = None
     prepared: PreparedLog | None = None
     findings: tuple[Finding, ...] = ()
@@ -47,7 +48,7 @@ class Inspection:
     smoothing: tuple[SmootherEffect, ...] = ()
     law: DeviceLaw | None = None
     lag: LagEstimate | None = None
-    refusal: str | None = None
+    refusal: BayesImpedanceError | None = None
 
 
 def inspect_recordings(files: Sequence[Path], config: Config) -> Inspection:
@@ -61,34 +62,32 @@ def inspect_recordings(files: Sequence[Path], config: Config) -> Inspection:
     repairs: list[str] = []
     with _heard(repairs):
         opened = list(open_files(files, config.log))
-        tables = tuple(table for file in opened for table in file.tables)
-        result = Inspection(config, tables)
+        result = Inspection(config, tuple(table for file in opened for table in file.tables))
         try:
-            readings = tuple(reading for file in opened for reading in read_tables(file, require_force=False))
-            result = replace(result, readings=readings)
-            log = as_log(readings)
+            result, log = _as_read(result, opened)
         except BayesImpedanceError as error:
-            return replace(result, refusal=str(error), repairs=tuple(repairs))
-    clocks = _clocks(readings)
-    found = [finding for name, clock in clocks.items() for finding in of_clock(name, clock)]
-    found += gathered([look_at(reading) for reading in readings])
-    result = replace(
-        result,
-        log=log,
-        findings=tuple(found),
-        clocks=clocks,
-        law=_law(log),
-        lag=_lag(log),
-    )
+            return replace(result, refusal=error, repairs=tuple(repairs))
+    result = replace(result, log=log, law=_law(log), lag=_lag(log))
     with _heard(repairs):
         try:
             result = replace(result, prepared=prepare(log, config.preprocessing))
         except BayesImpedanceError as error:
-            result = replace(result, refusal=str(error))
+            result = replace(result, refusal=error)
     # Of other windows nobody asked: what is said of them is not to be heard.
     with _heard([]):
         result = replace(result, smoothing=_smoothing(log, config.preprocessing.smoother))
     return replace(result, repairs=tuple(dict.fromkeys(repairs)))
+
+
+def _as_read(result: Inspection, opened: Sequence[Opened]) -> tuple[Inspection, InteractionLog]:
+    """What samples as they were read tell, and the log; afterwards the samples can go: an hour of them is much."""
+    readings = [reading for file in opened for reading in read_tables(file, require_force=False)]
+    clocks = _clocks(readings)
+    found = [finding for name, clock in clocks.items() for finding in of_clock(name, clock)]
+    found += gathered([look_at(reading) for reading in readings])
+    known = {reading.source: reading.preparation for reading in readings}
+    result = replace(result, findings=tuple(found), clocks=clocks, preparations=known)
+    return result, as_log(readings)
 
 
 @contextmanager

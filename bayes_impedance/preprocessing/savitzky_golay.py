@@ -28,12 +28,14 @@ class SavitzkyGolay:
     step: float
 
     def __call__(self, values: Array, derivative: int = 0) -> Array:
-        """Filtered `values (n, …)`; the first and last fits also serve the half windows at the ends."""
+        """Filtered `values (n, …)`, read-only; the first and last fits also serve the half windows at the ends."""
         half = self.length // 2
         fit, evaluate = self._fit(derivative)
         smoothed: Array = correlate1d(values, evaluate[half] @ fit, axis=0, mode="constant")
         smoothed[:half] = evaluate[:half] @ (fit @ values[: self.length])
         smoothed[-half:] = evaluate[half + 1 :] @ (fit @ values[-self.length :])
+        # So that it need not be copied where it is kept.
+        smoothed.setflags(write=False)
         return smoothed
 
     def coefficients(self, derivative: int = 0) -> Array:
