@@ -42,6 +42,8 @@ def open_parquet(file: Path, source: str, config: LogConfig) -> Opened:
             with pq.ParquetFile(file) as parquet:
                 # One after the other, so that Arrow's copy of a column goes before the next comes.
                 series = {name: parquet.read(columns=[name]).column(name).to_pandas() for name in names}
+            if any(len(column) != n for column in series.values()):
+                raise ValueError(f"columns without the {n} rows that the file declares")
         except UNREADABLE as error:
             raise LogError(
                 f"{source}: expected a readable table, found: {brief(error)}; write it anew"

@@ -6,6 +6,7 @@ links. Whatever warns fails the build, a name in back-ticks that the package doe
 
 from __future__ import annotations
 
+import platform
 import shutil
 import sys
 import warnings
@@ -28,6 +29,8 @@ def build(folder: Path) -> None:
         raise SystemExit(
             f"{folder}: expected a new folder or an older reference, found other content; name another"
         )
+    # h5py asks for it when it is imported, and pdoc lets no import run a command; from now on it is known.
+    platform.processor()
     with written_annotations():
         modules = {name: pdoc.doc.Module.from_name(name) for name in pdoc.extract.walk_specs([PACKAGE])}
         for module in modules.values():

@@ -13,6 +13,7 @@ import h5py
 import hdf5storage
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 import scipy.io
 from hypothesis import given, settings
@@ -165,6 +166,15 @@ def test_the_sentence_of_a_torn_file(tmp_path, format_, expected):
             "save it anew, or rename it by its format",
         ):
             read_log(path, CONFIG)
+
+
+def test_parquet_with_fewer_rows_than_it_declares(tmp_path, monkeypatch):
+    """Flipped bits of its footer do that, and Arrow does not mind."""
+    (tmp_path / "log.parquet").write_bytes(whole("Parquet"))
+    plain = pq.ParquetFile.read
+    monkeypatch.setattr(pq.ParquetFile, "read", lambda self, columns: plain(self, columns=columns).slice(1))
+    with pytest.raises(LogError, match=r"expected a readable table, found: columns without the 12 rows that"):
+        read_log(tmp_path / "log.parquet", CONFIG)
 
 
 # --- sizes that are only declared ----------------------------------------------------------------
