@@ -92,11 +92,6 @@ def follow(data: bytes, suffix: str) -> bool:
                 read_log(path, CONFIG)
             except (LogError, ConfigurationError) as error:
                 sentence = str(error)
-            except ValueError as error:
-                # Columns of several lengths, which nothing merges yet.
-                sentence = f"log: {error}"
-                if "too many values to unpack" not in sentence:
-                    raise
             else:
                 return True
     assert sentence.startswith("log") and "\n" not in sentence
