@@ -1,4 +1,4 @@
-"""The command line: demo, simulate, plan, train, infer, evaluate, show."""
+"""The command line: demo, simulate, inspect, plan, train, infer, evaluate, show."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ app = typer.Typer(
     help=(
         "Infer what a person's arm is (mass, damping, stiffness) and where the person wants to go (the desired "
         "trajectory) from logged motion and interaction force, with uncertainty.\n\n"
-        "A first round: [bold]bayes-impedance demo[/bold]. On your own log: [bold]train LOG --config phase --out "
+        "A first round: [bold]bayes-impedance demo[/bold]. On your own log: [bold]inspect LOG[/bold], [bold]train LOG --config phase --out "
         "MODEL[/bold], then [bold]infer MODEL LOG --out POSTERIOR.csv --figures FIGURES[/bold], [bold]evaluate MODEL "
         "OTHER_LOG --baseline naive[/bold], [bold]show MODEL[/bold]."
     ),
@@ -78,7 +78,7 @@ Logs = Annotated[
     list[Path],
     typer.Argument(
         metavar="LOG",
-        help="Recordings: .csv, .tsv, .txt or .parquet; several may follow.",
+        help="Recordings: tables, arrays or bags (README); several may follow.",
         show_default=False,
     ),
 ]

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 
 import h5py
@@ -97,12 +98,9 @@ def bare_csv(path: Path) -> float:
 def bare_mcap(path: Path) -> float:
     """Seconds for all messages, by a share of them."""
     with AnyReader([path]) as reader:
-        start, count = time.perf_counter(), 0
-        for connection, _, raw in reader.messages():
+        start = time.perf_counter()
+        for connection, _, raw in islice(reader.messages(), HOUR // SHARE):
             reader.deserialize(raw, connection.msgtype)
-            count += 1
-            if count == HOUR // SHARE:
-                break
         return SHARE * (time.perf_counter() - start)
 
 

@@ -56,6 +56,8 @@ def test_shipped_configurations_are_these():
         "position",
         "position_velocity",
         "recordings/delta_robot",
+        "recordings/gp_mpc",
+        "recordings/panda_comanipulation",
         "recordings/iiwa_known_equilibrium",
     }
 

@@ -51,6 +51,7 @@ def test_commands_run_in_the_order_shown(place: Path) -> None:
     ]
     assert [command.split()[1] for command in commands] == [
         "simulate",
+        "inspect",
         "train",
         "infer",
         "evaluate",

@@ -39,6 +39,8 @@ def test_wheel_outside_the_checkout(tmp_path: Path) -> None:
         "position",
         "position_velocity",
         "recordings/delta_robot",
+        "recordings/gp_mpc",
         "recordings/iiwa_known_equilibrium",
+        "recordings/panda_comanipulation",
         "time",
     ]
