@@ -10,6 +10,7 @@ import pytest
 from benchmarks.closed_loop_results import SEEDS, WAYS, estimate
 from benchmarks.core_results import configuration_of, coverage_of, demo, known_equilibrium
 from benchmarks.planning_results import ARMS, CHECKED_PERTURBATIONS, PERTURBATIONS, planned, widths
+from benchmarks.reading_results import BAGS, RECORDINGS, bag
 from benchmarks.recordings_results import last_third
 from benchmarks.simulated_arm_results import DAMPING, INTENTIONS, SESSIONS, STIFFNESS, Competition, table_i
 
@@ -144,6 +145,24 @@ def test_recordings(shared_data: Path) -> None:
     for name, scores in figures["axes"]["z"].items():
         assert now["axes"]["z"][name]["nlpd"] == pytest.approx(scores["nlpd"], abs=0.02)
     assert now["impedance_share"]["z"] == pytest.approx(figures["impedance_share"]["z"], abs=1e-3)
+
+
+@pytest.mark.parametrize("name", ["rail/1", "loader_edge_cases/polish_flat2_2_only31msgs"])
+def test_reading(shared_data: Path, name: str) -> None:
+    figures, now = committed("reading")["figures"]["gp_mpc"][name], bag(RECORDINGS / BAGS / f"{name}.bag")
+    assert {key: now[key] for key in ("samples", "refused") if key in now} == {
+        key: figures[key] for key in ("samples", "refused") if key in figures
+    }
+    for axis, law in figures.get("law", {}).items():
+        assert now["law"][axis] == pytest.approx(law, rel=1e-6)
+
+
+def test_the_law_of_the_robot_explains_every_run_on_the_rail() -> None:
+    figures = committed("reading")["figures"]["gp_mpc"]
+    for run in (1, 2, 3):
+        assert figures[f"rail/{run}"]["pooled_r_squared"] >= 0.75
+    refused = [name for name, entry in figures.items() if "refused" in entry]
+    assert refused == ["loader_edge_cases/polish_flat2_2_only31msgs"]
 
 
 def test_generated_inputs_left_no_traceback() -> None:

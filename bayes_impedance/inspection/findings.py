@@ -25,6 +25,8 @@ from bayes_impedance.recording.quality import (
 ENOUGH = 200_000
 #: A hand that moves less [m], or for a shorter time [s], does nothing to learn from.
 LEAST_REACH, SHORTEST = 1e-3, 1.0
+#: Gaps that are listed, the longest first.
+LISTED = 3
 
 
 @dataclass(frozen=True)
@@ -158,9 +160,11 @@ def _of_trial(reading: Reading) -> Iterator[Finding]:
 def of_clock(name: str, clock: ClockReport) -> Iterator[Finding]:
     """What is wrong with the time stamps of a stream or trial."""
     if clock.gaps:
-        start, longest = max(clock.gaps, key=lambda gap: gap[1])
+        longest = sorted(clock.gaps, key=lambda gap: -gap[1])[:LISTED]
+        listed = ", ".join(f"{length:.3g} s at {start:.6g} s" for start, length in longest)
         count = f"{len(clock.gaps)} gap{'s' if len(clock.gaps) > 1 else ''}"
-        yield Remark(f"{name}: {count} in the time stamps, the longest of {longest:.3g} s at {start:.6g} s")
+        which = "" if len(clock.gaps) <= LISTED else "the longest of "
+        yield Remark(f"{name}: {count} in the time stamps, {which}{listed}")
     if clock.duplicates:
         yield Remark(
             f"{name}: {clock.duplicates} time stamps equal to the one before; set log.clock.duplicates=drop"
