@@ -181,4 +181,9 @@ class LogConfig(Section):
             raise ValueError(f"axes: expected each axis once, got {list(self.axes)}")
         if self.columns.time is None and self.sampling_rate is None:
             raise ValueError("columns.time: null needs sampling_rate [Hz], got none; set log.sampling_rate")
+        if self.columns.orientation is None and (self.force.frame == "tool" or self.force.tool is not None):
+            raise ValueError(
+                "columns.orientation: expected the columns that tell how the tool turns, for log.force.frame is tool "
+                "or log.force.tool is given, got null"
+            )
         return self
