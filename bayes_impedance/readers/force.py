@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.signal import savgol_filter
+from scipy.spatial.transform import Rotation
 
 from bayes_impedance.config import LogConfig, ToolConfig
 from bayes_impedance.errors import LogError, LogWarning
@@ -94,12 +95,13 @@ class _Sensor:
         assert tool.identify.start is not None
         assert tool.identify.end is not None
         part = np.flatnonzero((samples.time >= tool.identify.start) & (samples.time < tool.identify.end))
+        rotation = self._rotation[part]
         torque = samples.values.get("torque")
         try:
             self.identification = identify_tool(
-                self.force[part],
-                None if torque is None else torque[part],
-                self._rotation[part],
+                self._in_sensor(self.force[part], rotation),
+                None if torque is None else self._in_sensor(torque[part], rotation),
+                rotation,
                 None if self._acceleration is None else self._acceleration[part],
                 self._gravity,
             )
@@ -120,13 +122,14 @@ class _Sensor:
         """Force of the human on the robot in the base frame, `(n, a)` [N]."""
         if not self._turned:
             return self.force
-        force = self.force
-        if not self._in_tool:
-            # The bias of a sensor is constant in its own frame.
-            force = in_base_frame(force, self._rotation.inv())
+        force = self._in_sensor(self.force, self._rotation)
         if self._tool is not None:
             force = without_tool(force, self._rotation, self._tool, self._acceleration, self._gravity)
         return in_base_frame(force, self._rotation)[:, self._axes]
+
+    def _in_sensor(self, vectors: Array, rotation: Rotation) -> Array:
+        """In the frame of the sensor, for there its bias is constant and its tool at rest."""
+        return vectors if self._in_tool else in_base_frame(vectors, rotation.inv())
 
 
 def _along(axes: Sequence[str], vectors: Array) -> Array:

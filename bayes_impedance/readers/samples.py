@@ -207,12 +207,12 @@ def _values(
     rows = RowNumbers(stream.rows.word, stream.rows.numbers[which])
     values, marks = {}, {}
     for key in part.keys:
-        cells = {name: stream.columns[name].iloc[which] for name in wanted[key]}
+        cells = [(stream.columns[name].iloc[which], name) for name in wanted[key]]
         if key in LABELS:
-            ((name, series),) = cells.items()
+            ((series, name),) = cells
             marks[key] = labels(rows, series, table.source, key, name)
         else:
-            columns = [numbers(rows, series, table.source, key, name) for name, series in cells.items()]
+            columns = [numbers(rows, series, table.source, key, name) for series, name in cells]
             values[key] = np.stack(columns, axis=-1)
             values[key] *= _scale(key, config)
     return rows, values, marks

@@ -71,6 +71,8 @@ def estimate_lag(
         (0.01, True)
     """
     added = np.zeros_like(force) if perturbation is None else perturbation
+    if len(time) < 2:
+        return _undetermined(f"expected at least two samples, found {len(time)}")
     step = float(np.median(np.diff(time)))
     parts = list(stretches(time, np.concatenate([force, added, position], axis=1), step))
     found: list[LagEstimate] = []
