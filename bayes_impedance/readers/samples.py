@@ -14,7 +14,7 @@ import pandas as pd
 from bayes_impedance.config import LogConfig
 from bayes_impedance.config.log import Quantity, Window
 from bayes_impedance.errors import LogError, LogWarning
-from bayes_impedance.log import Array, RowNumbers
+from bayes_impedance.log import Array, RowNumbers, named_rows
 from bayes_impedance.readers.cells import labels, numbers
 from bayes_impedance.readers.columns import TIMES
 from bayes_impedance.readers.table import Stream, Table
@@ -171,7 +171,15 @@ def _clock(
         clock = choose_clock(stream.received, None, config.clock, place)
         report = replace(clock.report, source="record", why="messages carry no stamp of their sender")
         return replace(clock, report=report, against_recorder=RECORDER)
-    return choose_clock(_time(table, part, wanted, config), None, config.clock, place)
+    time = _time(table, part, wanted, config)
+    back = np.flatnonzero(np.diff(time) < 0)
+    if len(back):
+        raise LogError(
+            f"{place}: expected times that do not go back, for samples at two sets of time stamps meet in one "
+            f"recording only, found {time[back[0] + 1]:g} s after {time[back[0]]:g} s at "
+            f"{named_rows(back[:1] + 1, stream.rows)}; write a file for each trial, or set log.columns.force_time to null"
+        )
+    return choose_clock(time, None, config.clock, place)
 
 
 def within(time: Array, window: Window) -> npt.NDArray[np.bool_]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -137,9 +137,7 @@ TOOL = {
 }
 
 
-def handled(
-    rate: float = 200.0, brisk: float = 0.0, seed: int = 0, sign: float = 1.0
-) -> Mapping[str, Any]:
+def handled(rate: float = 200.0, brisk: float = 0.0, seed: int = 0, sign: float = 1.0) -> Mapping[str, Any]:
     """40 s of a tool that turns by ±40°, the first 20 s without contact, and what the sensor in its frame reads.
 
     `brisk` [m]: the hand shakes by as much at 2 Hz. Force of the human, tool, position are in closed form; the sensor
@@ -176,7 +174,3 @@ def handled(
 def identify(**log: Any) -> dict[str, Any]:
     """The configuration that finds the tool."""
     return {"frame": "tool", "tool": {"identify": {"start": 0, "end": 20}}} | log
-
-
-def xyz(names: Sequence[str]) -> tuple[str, ...]:
-    return tuple(f"orientation_{name}" for name in names)

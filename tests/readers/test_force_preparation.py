@@ -216,7 +216,8 @@ def test_lag_is_taken_off_before_the_tool_is_found(tmp_path: Path) -> None:
 def test_reversed_sign_is_named(tmp_path: Path) -> None:
     file = written(tmp_path / "log.csv", table(handled(sign=-1.0)))
     with pytest.raises(
-        LogError, match=r"^log.csv: expected a tool of positive mass, found -1.8.* kg: the force is probably of rever"
+        LogError,
+        match=r"^log.csv: expected a tool of positive mass, found -1.8.* kg: the force is probably of rever",
     ):
         read(file, **turned(**identify()))
 
@@ -234,7 +235,9 @@ def test_sign_of_the_robot_is_mended_by_the_configuration(tmp_path: Path) -> Non
 
 def test_a_part_that_is_too_short_is_refused_with_the_name_of_the_file(tmp_path: Path) -> None:
     file = written(tmp_path / "log.csv", table(handled()))
-    with pytest.raises(LogError, match="log.csv: expected at least ten samples without contact, found 0; widen"):
+    with pytest.raises(
+        LogError, match="log.csv: expected at least ten samples without contact, found 0; widen"
+    ):
         read(file, **turned(frame="tool", tool={"identify": {"start": 50, "end": 60}}))
 
 
@@ -256,7 +259,9 @@ def test_columns_that_do_not_fit_the_convention_are_refused(tmp_path: Path, own_
     else:
         file = written(tmp_path / "log.csv", table(made, "ZYZ"))
         names = {"orientation": list(WAYS["ZYZ"][1])}
-    with pytest.raises(LogError, match="log.*: orientation: expected 4 columns for log.force.rotation quaternion_xyzw"):
+    with pytest.raises(
+        LogError, match="log.*: orientation: expected 4 columns for log.force.rotation quaternion_xyzw"
+    ):
         read(file, columns=names, force={"frame": "tool"})
 
 
@@ -296,14 +301,18 @@ def test_a_turned_force_without_orientation_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("force", [{"frame": "tool"}, {"tool": {"mass": 1.0}}])
 def test_a_turned_force_needs_an_orientation_that_is_named(tmp_path: Path, force: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match="columns.orientation: expected the columns that tell how the tool turns"):
+    with pytest.raises(
+        ValueError, match="columns.orientation: expected the columns that tell how the tool turns"
+    ):
         read(tmp_path / "log.csv", columns={"orientation": None}, force=force)
 
 
 def test_orientation_that_jumps_is_questioned_once_for_a_file(tmp_path: Path) -> None:
     frame = table(handled(rate=50.0))
     frame.loc[100:, ["qx", "qy"]] *= -1
-    with pytest.warns(LogWarning, match="log.csv: orientation jumps by more than 0.5 rad .* once, first at row 100"):
+    with pytest.warns(
+        LogWarning, match="log.csv: orientation jumps by more than 0.5 rad .* once, first at row 100"
+    ):
         read(written(tmp_path / "log.csv", frame), **turned(frame="tool"))
 
 
