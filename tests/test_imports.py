@@ -63,6 +63,7 @@ READERS = (
     "readers.matlab_elements",
     "readers.matlab_hdf5",
     "readers.matlab",
+    "readers.times",
     "readers.samples",
     "readers.force",
     "readers.trials",

@@ -14,9 +14,10 @@ from bayes_impedance.config import LogConfig, ToolConfig
 from bayes_impedance.errors import LogError, LogWarning
 from bayes_impedance.log import AXES, Array
 from bayes_impedance.readers.columns import is_turned
-from bayes_impedance.readers.samples import OF_THE_SENSOR, Samples, within
+from bayes_impedance.readers.samples import Samples
+from bayes_impedance.readers.times import OF_THE_SENSOR, within
 from bayes_impedance.recording.lag import LagEstimate, estimate_lag, remove_lag
-from bayes_impedance.recording.tool import Identification, Tool, identify_tool, without_tool
+from bayes_impedance.recording.tool import SMALLEST_SHARE, Identification, Tool, identify_tool, without_tool
 from bayes_impedance.recording.wrench import in_base_frame, rotation_jumps, rotations
 
 #: Over which the acceleration of a tool is taken from its positions [s].
@@ -38,7 +39,8 @@ def prepare_force(
 ) -> tuple[Samples, Preparation]:
     """`samples` with the force of the human along `axes` of the base frame, at the time it acted.
 
-    Warns (LogWarning) where a lag was removed or could not be told, and where the orientation jumps.
+    Warns (LogWarning) where a lag was removed or could not be told, the orientation jumps, or weight explains little of
+    what was felt in the part without contact.
 
     Raises:
         LogError: the orientation is none, or the tool cannot be told.
@@ -52,7 +54,7 @@ def prepare_force(
     # A tool is told by force as it was at the time of its orientation.
     samples = _without_lag(samples, lag, source) if lag else samples
     sensor = _Sensor(samples, config, axes, source)
-    sensor.question_orientation(samples.time, source)
+    sensor.question(samples.time, source)
     prepared = {"force": sensor.human(), "position": _along(axes, samples.values["position"])}
     human = replace(samples, values=dict(samples.values) | prepared)
     inside = within(human.time, config.window)
@@ -109,14 +111,16 @@ class _Sensor:
             raise LogError(f"{source}: {error}") from error
         self._tool = self.identification.tool
 
-    def question_orientation(self, time: Array, source: str) -> None:
-        """Warn (LogWarning) where the tool turns faster than a hand can turn it."""
+    def question(self, time: Array, source: str) -> None:
+        """Warn (LogWarning) of an orientation that jumps, and of a tool whose weight is not what the sensor felt."""
         if not self._turned:
             return
         starts = np.array([part.start for part in _stretches(time)], dtype=np.int64)
         jumps = rotation_jumps(self._rotation, starts)
         if jumps is not None:
             warnings.warn(f"{source}: {jumps.sentence}", LogWarning, stacklevel=4)
+        if self.identification is not None and self.identification.explained < SMALLEST_SHARE:
+            warnings.warn(f"{source}: {self.identification.sentence}", LogWarning, stacklevel=4)
 
     def human(self) -> Array:
         """Force of the human on the robot in the base frame, `(n, a)` [N]."""

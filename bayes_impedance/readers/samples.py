@@ -5,22 +5,20 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pandas as pd
 
 from bayes_impedance.config import LogConfig
-from bayes_impedance.config.log import Quantity, Window
+from bayes_impedance.config.log import Quantity
 from bayes_impedance.errors import LogError, LogWarning
-from bayes_impedance.log import Array, RowNumbers, named_rows
+from bayes_impedance.log import Array, RowNumbers
 from bayes_impedance.readers.cells import labels, numbers
 from bayes_impedance.readers.columns import TIMES
 from bayes_impedance.readers.table import Stream, Table
+from bayes_impedance.readers.times import OF_THE_SENSOR, Part, clock_of, time_of, within
 from bayes_impedance.recording import synchronise as on_one_clock
-from bayes_impedance.recording.clock import ClockReport, StreamClock, choose_clock
-from bayes_impedance.recording.offset import RECORDER
+from bayes_impedance.recording.clock import ClockReport, StreamClock
 from bayes_impedance.recording.wrench import rotations
 
 LABELS = ("trial", "group", "repetition")
@@ -34,8 +32,6 @@ QUANTITIES: Mapping[str, Quantity] = {
     "perturbation": "force",
     "torque": "torque",
 }
-#: What has the time stamps of `log.columns.force_time`.
-OF_THE_SENSOR = ("force", "torque")
 
 #: Which samples: a slice copies nothing.
 Which = slice | npt.NDArray[np.bool_] | npt.NDArray[np.int64]
@@ -65,16 +61,6 @@ class Samples:
         )
 
 
-@dataclass(frozen=True)
-class _Part:
-    """Quantities that share a stream and its time stamps; `clock`: the key of their column of time."""
-
-    name: str
-    stream: Stream
-    clock: str
-    keys: tuple[str, ...]
-
-
 def read_samples(table: Table, wanted: Mapping[str, tuple[str, ...]], config: LogConfig) -> Samples:
     """The `wanted` columns of a table, all at the times of position, within `log.window` or where a tool is identified.
 
@@ -86,8 +72,8 @@ def read_samples(table: Table, wanted: Mapping[str, tuple[str, ...]], config: Lo
     names = list(dict.fromkeys(name for columns in wanted.values() for name in columns))
     texts = {name for key in LABELS for name in wanted.get(key, ())}
     base, *others = _parts(table, table.load(names, texts), wanted)
-    clock = None if not (table.timed or others) else _clock(table, base, wanted, config)
-    time = _time(table, base, wanted, config) if clock is None else clock.time
+    clock = None if not (table.timed or others) else clock_of(table, base, wanted, config)
+    time = time_of(table, base, wanted, config) if clock is None else clock.time
     zero = time[0] if table.timed else 0.0
     inside = _needed(table, time - zero, config, "force" in wanted)
     samples = _values(table, base, wanted, config, inside if clock is None else clock.kept[inside])
@@ -96,7 +82,7 @@ def read_samples(table: Table, wanted: Mapping[str, tuple[str, ...]], config: Lo
     return _merged(table, _Timed(base, clock, *samples), time[inside], zero, others, wanted, config)
 
 
-def _parts(table: Table, streams: Sequence[Stream], wanted: Mapping[str, tuple[str, ...]]) -> list[_Part]:
+def _parts(table: Table, streams: Sequence[Stream], wanted: Mapping[str, tuple[str, ...]]) -> list[Part]:
     """Quantities by stream and clock, those with position first."""
     parts: dict[tuple[int, str], list[str]] = {}
     for key, columns in wanted.items():
@@ -111,7 +97,7 @@ def _parts(table: Table, streams: Sequence[Stream], wanted: Mapping[str, tuple[s
         clock = "force_time" if key in OF_THE_SENSOR and "force_time" in wanted else "time"
         parts.setdefault((own.pop(), clock), []).append(key)
     found = [
-        _Part(f"{streams[i].name or ', '.join(keys)}", streams[i], clock, tuple(keys))
+        Part(f"{streams[i].name or ', '.join(keys)}", streams[i], clock, tuple(keys))
         for (i, clock), keys in parts.items()
     ]
     found.sort(key=lambda part: "position" not in part.keys)
@@ -122,71 +108,6 @@ def _parts(table: Table, streams: Sequence[Stream], wanted: Mapping[str, tuple[s
             f"position, or set log.columns.{apart[0]} to null"
         )
     return found
-
-
-# --- time ----------------------------------------------------------------------------------------
-
-
-def _time(table: Table, part: _Part, wanted: Mapping[str, tuple[str, ...]], config: LogConfig) -> Array:
-    """A column of time, or that of samples at `log.sampling_rate`, anew in each trial [s]."""
-    rows, columns = part.stream.rows, part.stream.columns
-    leading = "position" in part.keys
-    if part.clock not in wanted and leading:
-        assert config.sampling_rate is not None
-        return _counted(len(rows.numbers), columns[wanted["trial"][0]] if "trial" in wanted else None) / (
-            config.sampling_rate
-        )
-    (name,) = wanted.get(part.clock, ("position",))
-    if name not in columns or part.clock not in wanted:
-        if leading:
-            mend = "name their time stamps in log.columns.time"
-        elif set(part.keys) <= set(OF_THE_SENSOR):
-            mend = "name their time stamps in log.columns.force_time"
-        else:
-            mend = f"set log.columns.{part.keys[0]} to null"
-        raise LogError(
-            f"{table.source}: expected as many samples of {', '.join(part.keys)} as of {name}, which tells their "
-            f"time, found {len(rows.numbers)} and another number; {mend}"
-        )
-    return numbers(rows, columns[name], table.source, part.clock, name) * config.units.scale("time")
-
-
-def _counted(n: int, trials: pd.Series[Any] | None) -> Array:
-    """Samples since the first of each trial, `(n,)`."""
-    count = np.arange(float(n))
-    if trials is None:
-        return count
-    starts = np.diff(pd.factorize(trials)[0], prepend=-1) != 0
-    return count - np.maximum.accumulate(np.where(starts, count, 0.0))
-
-
-def _clock(
-    table: Table, part: _Part, wanted: Mapping[str, tuple[str, ...]], config: LogConfig
-) -> StreamClock:
-    stream = part.stream
-    place = f"{table.source}, {part.name}"
-    if stream.sent is not None:
-        return choose_clock(stream.sent, stream.received, config.clock, place)
-    if stream.received is not None:
-        clock = choose_clock(stream.received, None, config.clock, place)
-        report = replace(clock.report, source="record", why="messages carry no stamp of their sender")
-        return replace(clock, report=report, against_recorder=RECORDER)
-    time = _time(table, part, wanted, config)
-    back = np.flatnonzero(np.diff(time) < 0)
-    if len(back):
-        raise LogError(
-            f"{place}: expected times that do not go back, for samples at two sets of time stamps meet in one "
-            f"recording only, found {time[back[0] + 1]:g} s after {time[back[0]]:g} s at "
-            f"{named_rows(back[:1] + 1, stream.rows)}; write a file for each trial, or set log.columns.force_time to null"
-        )
-    return choose_clock(time, None, config.clock, place)
-
-
-def within(time: Array, window: Window) -> npt.NDArray[np.bool_]:
-    """Which of the times `(n,)` [s] lie in a window."""
-    start = -np.inf if window.start is None else window.start
-    end = np.inf if window.end is None else window.end
-    return np.asarray((time >= start) & (time < end))
 
 
 def _needed(table: Table, time: Array, config: LogConfig, forces: bool) -> Which:
@@ -208,7 +129,7 @@ def _needed(table: Table, time: Array, config: LogConfig, forces: bool) -> Which
 
 
 def _values(
-    table: Table, part: _Part, wanted: Mapping[str, tuple[str, ...]], config: LogConfig, which: Which
+    table: Table, part: Part, wanted: Mapping[str, tuple[str, ...]], config: LogConfig, which: Which
 ) -> tuple[RowNumbers, dict[str, Array], dict[str, npt.NDArray[np.object_]]]:
     """The numbers of some rows of a part, its values in SI units and its labels."""
     stream = part.stream
@@ -244,7 +165,7 @@ def _scale(key: str, config: LogConfig) -> float:
 class _Timed:
     """A part with its clock and what `_values` made of it."""
 
-    part: _Part
+    part: Part
     clock: StreamClock
     rows: RowNumbers
     values: Mapping[str, Array]
@@ -256,7 +177,7 @@ def _merged(
     base: _Timed,
     time: Array,
     zero: float,
-    others: Sequence[_Part],
+    others: Sequence[Part],
     wanted: Mapping[str, tuple[str, ...]],
     config: LogConfig,
 ) -> Samples:
@@ -268,7 +189,7 @@ def _merged(
     streams: list[on_one_clock.Stream] = []
     first_of_part = []
     for part in others:
-        clock = _clock(table, part, wanted, config)
+        clock = clock_of(table, part, wanted, config)
         clocks[part.name] = clock.report
         near, times = _near(leading, part.name, clock, config)
         _, values, _ = _values(table, part, wanted, config, clock.kept[near])

@@ -210,6 +210,17 @@ def test_lag_is_taken_off_before_the_tool_is_found(tmp_path: Path) -> None:
     assert rms(error_of(reading, made)) < 2 * NOISE
 
 
+def test_contact_where_none_was_said_to_be_is_questioned(tmp_path: Path) -> None:
+    made = handled(rate=50.0)
+    frame = table(made)
+    pushed = 40.0 * np.sin(np.array([2.0, 2.7, 1.4]) * made["time"][:, None])
+    frame[["force_x", "force_y", "force_z"]] += pushed
+    with pytest.warns(
+        LogWarning, match="log.csv: tool of .* kg.*; weight explains only .* and that nothing touches it"
+    ):
+        read(written(tmp_path / "log.csv", frame), **turned(**identify()))
+
+
 # --- sign ----------------------------------------------------------------------------------------
 
 

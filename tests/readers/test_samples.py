@@ -352,6 +352,10 @@ def test_samples_without_time_begin_anew_in_each_trial(tmp_path: Path) -> None:
     log = {"columns": {"time": None}, "sampling_rate": 100.0}
     for trial in read(file, **log).trials:
         np.testing.assert_allclose(trial.time, LINE, atol=1e-12)
+    apart = as_csv(tmp_path / "apart.csv", both.sort_index(kind="stable"))
+    for trial in read(apart, **log).trials:
+        np.testing.assert_allclose(trial.time, LINE, atol=1e-12)
+        np.testing.assert_array_equal(trial.force, force_at(LINE))
     # A window is a part of each trial.
     for trial in read(file, window={"start": 1.0, "end": 2.0}, **log).trials:
         np.testing.assert_allclose(trial.position, position_at(LINE[100:200]))
