@@ -116,7 +116,7 @@ def open_file(file: Path, source: str, config: LogConfig) -> Opened:
         LogError: it is missing, unreadable, or of no known format.
     """
     # ROS 2 records into a folder.
-    recorded = (file / "metadata.yaml").is_file()
+    recorded = file.is_dir() and (file / "metadata.yaml").is_file()
     if file.is_dir() and not recorded:
         raise LogError(f"{source}: expected a file, found a folder; name the recordings in it")
     if not file.exists():
