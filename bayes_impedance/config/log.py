@@ -109,8 +109,8 @@ class ClockConfig(Section):
 class ToolConfig(Section):
     """What hangs on the force sensor between it and the hand; its weight, inertia and bias are taken off.
 
-    Either `identify`, a part of the recording [s] in which nobody touches it while the robot turns it about, or
-    the values themselves: `mass` [kg], `center_of_mass` [m], `bias` [N] and `torque_bias` [Nm] in the frame of the
+    Either `identify`, a part of the recording [s] in which nobody touches it while the robot turns it about (it may lie
+    outside `log.window`), or the values themselves: `mass` [kg], `center_of_mass` [m], `bias` [N] and `torque_bias` [Nm] in the frame of the
     sensor, in the sign of the force of the human. `inertia`: take off m a as well as the weight, for a handle that
     moves briskly. `gravity`: in the base frame [m/s²].
     """
@@ -161,7 +161,8 @@ class ForceConfig(Section):
 class LogConfig(Section):
     """How a recording maps onto an interaction log.
 
-    `root`: where in a file of arrays (HDF5, MATLAB) the recordings lie. `sampling_rate` [Hz]: for files without time.
+    `root`: where in a file of arrays (HDF5, MATLAB) the recordings lie. `sampling_rate` [Hz]: for files without time,
+    which then begins at zero in each trial.
     """
 
     axes: tuple[Axis, ...] | None = Field(default=None, min_length=1)
