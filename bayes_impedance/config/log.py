@@ -110,9 +110,9 @@ class ToolConfig(Section):
     """What hangs on the force sensor between it and the hand; its weight, inertia and bias are taken off.
 
     Either `identify`, a part of the recording [s] in which nobody touches it while the robot turns it about (it may lie
-    outside `log.window`), or the values themselves: `mass` [kg], `center_of_mass` [m], `bias` [N] and `torque_bias` [Nm] in the frame of the
-    sensor, in the sign of the force of the human. `inertia`: take off m a as well as the weight, for a handle that
-    moves briskly. `gravity`: in the base frame [m/s²].
+    outside `log.window`), or the values themselves: `mass` [kg], `center_of_mass` [m], `bias` [N] and `torque_bias`
+    [Nm] in the frame of the sensor, in the sign of the force of the human. `inertia`: take off m a as well as the
+    weight, for a handle that moves briskly. `gravity`: in the base frame [m/s²].
     """
 
     identify: Window | None = None

@@ -74,6 +74,8 @@ def estimate_lag(
     if len(time) < 2:
         return _undetermined(f"expected at least two samples, found {len(time)}")
     step = float(np.median(np.diff(time)))
+    if step <= 0:
+        return _undetermined("expected times that increase, found most that do not")
     parts = list(stretches(time, np.concatenate([force, added, position], axis=1), step))
     found: list[LagEstimate] = []
     shift = 0

@@ -199,6 +199,18 @@ def test_a_log_of_one_sample_is_refused_for_that(tmp_path: Path) -> None:
         read(file, force={"lag": "estimate"})
 
 
+@pytest.mark.parametrize("direction", [0.0, -1.0])
+def test_times_that_do_not_increase_are_refused_for_that(tmp_path: Path, direction: float) -> None:
+    table = columns(time=direction * np.arange(50.0), position=np.eye(50)[:, :2], force=np.eye(50)[:, :2])
+    with (
+        pytest.warns(
+            LogWarning, match=r"cannot be told \(expected times that increase, found most that do not\)"
+        ),
+        pytest.raises(LogError, match="log.csv, trial 't0'.*time"),
+    ):
+        read(as_csv(tmp_path / "log.csv", [table]), force={"lag": "estimate"})
+
+
 def test_a_lag_as_long_as_the_log_is_refused(tmp_path: Path) -> None:
     table = columns(time=0.1 * np.arange(10), position=np.arange(10.0)[:, None], force=np.ones((10, 1)))
     with pytest.raises(
