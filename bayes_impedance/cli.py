@@ -67,9 +67,9 @@ app = typer.Typer(
     help=(
         "Infer what a person's arm is (mass, damping, stiffness) and where the person wants to go (the desired "
         "trajectory) from logged motion and interaction force, with uncertainty.\n\n"
-        "A first round: [bold]bayes-impedance demo[/bold]. On your own log: [bold]inspect LOG[/bold], [bold]train LOG --config phase --out "
-        "MODEL[/bold], then [bold]infer MODEL LOG --out POSTERIOR.csv --figures FIGURES[/bold], [bold]evaluate MODEL "
-        "OTHER_LOG --baseline naive[/bold], [bold]show MODEL[/bold]."
+        "A first round: [bold]bayes-impedance demo[/bold]. On your own log: [bold]inspect LOG[/bold], [bold]train LOG "
+        "--config phase --out MODEL[/bold], then [bold]infer MODEL LOG --out POSTERIOR.csv --figures FIGURES[/bold], "
+        "[bold]evaluate MODEL OTHER_LOG --baseline naive[/bold], [bold]show MODEL[/bold]."
     ),
 )
 

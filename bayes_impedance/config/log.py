@@ -109,10 +109,10 @@ class ClockConfig(Section):
 class ToolConfig(Section):
     """What hangs on the force sensor between it and the hand; its weight, inertia and bias are taken off.
 
-    Either `identify`, a part of the recording [s] in which nobody touches it while the robot turns it about, or
-    the values themselves: `mass` [kg], `center_of_mass` [m], `bias` [N] and `torque_bias` [Nm] in the frame of the
-    sensor, in the sign of the force of the human. `inertia`: take off m a as well as the weight, for a handle that
-    moves briskly. `gravity`: in the base frame [m/s²].
+    Either `identify`, a part of the recording [s] in which nobody touches it while the robot turns it about (it may lie
+    outside `log.window`), or the values themselves: `mass` [kg], `center_of_mass` [m], `bias` [N] and `torque_bias`
+    [Nm] in the frame of the sensor, in the sign of the force of the human. `inertia`: take off m a as well as the
+    weight, for a handle that moves briskly. `gravity`: in the base frame [m/s²].
     """
 
     identify: Window | None = None
@@ -161,7 +161,8 @@ class ForceConfig(Section):
 class LogConfig(Section):
     """How a recording maps onto an interaction log.
 
-    `root`: where in a file of arrays (HDF5, MATLAB) the recordings lie. `sampling_rate` [Hz]: for files without time.
+    `root`: where in a file of arrays (HDF5, MATLAB) the recordings lie. `sampling_rate` [Hz]: for files without time,
+    which then begins at zero in each trial.
     """
 
     axes: tuple[Axis, ...] | None = Field(default=None, min_length=1)
@@ -181,4 +182,9 @@ class LogConfig(Section):
             raise ValueError(f"axes: expected each axis once, got {list(self.axes)}")
         if self.columns.time is None and self.sampling_rate is None:
             raise ValueError("columns.time: null needs sampling_rate [Hz], got none; set log.sampling_rate")
+        if self.columns.orientation is None and (self.force.frame == "tool" or self.force.tool is not None):
+            raise ValueError(
+                "columns.orientation: expected the columns that tell how the tool turns, for log.force.frame is tool "
+                "or log.force.tool is given, got null"
+            )
         return self

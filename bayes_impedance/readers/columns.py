@@ -47,13 +47,16 @@ def wanted_columns(
     """
     columns = config.columns
     required = {"time", "position"} | ({"force"} if require_force else set())
-    if is_turned(config):
+    # A log without force has nothing that could be turned.
+    forces = require_force or not set(_names(columns, "force", axes) or ()).isdisjoint(table.columns)
+    turned = is_turned(config) and forces
+    if turned:
         required |= {"orientation"}
     wanted: dict[str, tuple[str, ...]] = {}
     for key in Columns.model_fields:
-        names = _names(columns, key, _axes_of_quantity(key, config, axes))
+        names = _names(columns, key, _axes_of_quantity(key, config, axes) if turned else axes)
         # Messages carry their time.
-        if names is None or (key in WRENCH and not is_turned(config)) or (key in TIMES and table.timed):
+        if names is None or (key in WRENCH and not turned) or (key in TIMES and table.timed):
             continue
         absent = [name for name in names if name not in table.columns]
         # A name that the user wrote down is a name that the user expects to be there.
@@ -83,8 +86,7 @@ def is_turned(config: LogConfig) -> bool:
 def _axes_of_quantity(key: str, config: LogConfig, axes: tuple[str, ...]) -> tuple[str, ...]:
     # A vector turns as a whole, whatever axes are wanted in the end; so does the acceleration of a tool.
     moves = config.force.tool is not None and config.force.tool.inertia
-    whole = is_turned(config) and (key in ("force", "torque") or (moves and key == "position"))
-    return AXES if whole else axes
+    return AXES if key in ("force", "torque") or (moves and key == "position") else axes
 
 
 def _names(columns: Columns, key: str, axes: tuple[str, ...]) -> tuple[str, ...] | None:

@@ -8,14 +8,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.signal import savgol_filter
+from scipy.spatial.transform import Rotation
 
 from bayes_impedance.config import LogConfig, ToolConfig
 from bayes_impedance.errors import LogError, LogWarning
-from bayes_impedance.log import AXES, Array, Integers, RowNumbers
+from bayes_impedance.log import AXES, Array
 from bayes_impedance.readers.columns import is_turned
 from bayes_impedance.readers.samples import Samples
+from bayes_impedance.readers.times import OF_THE_SENSOR, within
 from bayes_impedance.recording.lag import LagEstimate, estimate_lag, remove_lag
-from bayes_impedance.recording.tool import Identification, Tool, identify_tool, without_tool
+from bayes_impedance.recording.tool import SMALLEST_SHARE, Identification, Tool, identify_tool, without_tool
 from bayes_impedance.recording.wrench import in_base_frame, rotation_jumps, rotations
 
 #: Over which the acceleration of a tool is taken from its positions [s].
@@ -37,41 +39,26 @@ def prepare_force(
 ) -> tuple[Samples, Preparation]:
     """`samples` with the force of the human along `axes` of the base frame, at the time it acted.
 
-    Warns (LogWarning) where a lag was removed or could not be told, and where the orientation jumps.
+    Warns (LogWarning) where a lag was removed or could not be told, the orientation jumps, or weight explains little of
+    what was felt in the part without contact.
 
     Raises:
         LogError: the orientation is none, or the tool cannot be told.
     """
     if "force" not in samples.values:
         return samples, Preparation()
-    sensor = _Sensor(samples, config, axes, source)
-    position = samples.values["position"]
-    if position.shape[1] > len(axes):
-        position = position[:, [AXES.index(axis) for axis in axes]]
     lag, estimate = config.force.lag, None
     if lag == "estimate":
-        added = samples.values.get("perturbation")
-        estimate = estimate_lag(samples.time, position, sensor.human(), perturbation=added)
+        estimate = _estimate(samples, config, axes, source)
         lag = _stated(estimate, source)
-    kept = np.arange(len(samples.time))
-    if lag:
-        sensor.force, kept = _without_lag(samples.time, sensor.force, lag)
-        if not len(kept):
-            raise LogError(
-                f"{source}: expected a log longer than the lag of its force, found a lag of {lag:g} s; change "
-                "log.force.lag"
-            )
-    values = dict(samples.values) | {"force": sensor.human(), "position": position}
-    return (
-        replace(
-            samples,
-            time=samples.time[kept],
-            rows=RowNumbers(samples.rows.word, samples.rows.numbers[kept]),
-            values={key: value[kept] for key, value in values.items()},
-            labels={key: marks[kept] for key, marks in samples.labels.items()},
-        ),
-        Preparation(sensor.identification, estimate),
-    )
+    # A tool is told by force as it was at the time of its orientation.
+    samples = _without_lag(samples, lag, source) if lag else samples
+    sensor = _Sensor(samples, config, axes, source)
+    sensor.question(samples.time, source)
+    prepared = {"force": sensor.human(), "position": _along(axes, samples.values["position"])}
+    human = replace(samples, values=dict(samples.values) | prepared)
+    inside = within(human.time, config.window)
+    return human if inside.all() else human.at(inside), Preparation(sensor.identification, estimate)
 
 
 # --- frame and tool ------------------------------------------------------------------------------
@@ -92,9 +79,6 @@ class _Sensor:
             self._rotation = rotations(samples.values["orientation"], config.force.rotation)
         except LogError as error:
             raise LogError(f"{source}: {error}") from error
-        jumps = rotation_jumps(self._rotation)
-        if jumps is not None:
-            warnings.warn(f"{source}: {jumps.sentence}", LogWarning, stacklevel=3)
         self._tool: Tool | None = None
         self._gravity = np.zeros(3)
         self._acceleration: Array | None = None
@@ -113,12 +97,13 @@ class _Sensor:
         assert tool.identify.start is not None
         assert tool.identify.end is not None
         part = np.flatnonzero((samples.time >= tool.identify.start) & (samples.time < tool.identify.end))
+        rotation = self._rotation[part]
         torque = samples.values.get("torque")
         try:
             self.identification = identify_tool(
-                self.force[part],
-                None if torque is None else torque[part],
-                self._rotation[part],
+                self._in_sensor(self.force[part], rotation),
+                None if torque is None else self._in_sensor(torque[part], rotation),
+                rotation,
                 None if self._acceleration is None else self._acceleration[part],
                 self._gravity,
             )
@@ -126,17 +111,34 @@ class _Sensor:
             raise LogError(f"{source}: {error}") from error
         self._tool = self.identification.tool
 
+    def question(self, time: Array, source: str) -> None:
+        """Warn (LogWarning) of an orientation that jumps, and of a tool whose weight is not what the sensor felt."""
+        if not self._turned:
+            return
+        starts = np.array([part.start for part in _stretches(time)], dtype=np.int64)
+        jumps = rotation_jumps(self._rotation, starts)
+        if jumps is not None:
+            warnings.warn(f"{source}: {jumps.sentence}", LogWarning, stacklevel=4)
+        if self.identification is not None and self.identification.explained < SMALLEST_SHARE:
+            warnings.warn(f"{source}: {self.identification.sentence}", LogWarning, stacklevel=4)
+
     def human(self) -> Array:
         """Force of the human on the robot in the base frame, `(n, a)` [N]."""
         if not self._turned:
             return self.force
-        force = self.force
-        if not self._in_tool:
-            # The bias of a sensor is constant in its own frame.
-            force = in_base_frame(force, self._rotation.inv())
+        force = self._in_sensor(self.force, self._rotation)
         if self._tool is not None:
             force = without_tool(force, self._rotation, self._tool, self._acceleration, self._gravity)
         return in_base_frame(force, self._rotation)[:, self._axes]
+
+    def _in_sensor(self, vectors: Array, rotation: Rotation) -> Array:
+        """In the frame of the sensor, for there its bias is constant and its tool at rest."""
+        return vectors if self._in_tool else in_base_frame(vectors, rotation.inv())
+
+
+def _along(axes: Sequence[str], vectors: Array) -> Array:
+    """The components along `axes` of vectors that hold these or all."""
+    return vectors if vectors.shape[1] == len(axes) else vectors[:, [AXES.index(axis) for axis in axes]]
 
 
 def _acceleration(time: Array, position: Array) -> Array:
@@ -151,6 +153,20 @@ def _acceleration(time: Array, position: Array) -> Array:
 
 
 # --- lag -----------------------------------------------------------------------------------------
+
+
+def _estimate(samples: Samples, config: LogConfig, axes: Sequence[str], source: str) -> LagEstimate:
+    """From the part that is kept, for without contact no law holds."""
+    inside = within(samples.time, config.window)
+    position = _along(axes, samples.values["position"])
+    force = _Sensor(samples, config, axes, source).human()
+    added = samples.values.get("perturbation")
+    return estimate_lag(
+        samples.time[inside],
+        position[inside],
+        force[inside],
+        perturbation=None if added is None else added[inside],
+    )
 
 
 def _stated(estimate: LagEstimate, source: str) -> float:
@@ -169,16 +185,30 @@ def _stated(estimate: LagEstimate, source: str) -> float:
     return estimate.lag if estimate.determined else 0.0
 
 
-def _without_lag(time: Array, force: Array, lag: float) -> tuple[Array, Integers]:
-    """Force moved by `lag` [s], on all rows, and the rows `(m,)` that it is known at."""
-    moved, kept = force.copy(), []
+def _without_lag(samples: Samples, lag: float, source: str) -> Samples:
+    """What the sensor read moved by `lag` [s], and the samples that have it.
+
+    Raises:
+        LogError: none have.
+    """
+    time = samples.time
+    moved = {key: samples.values[key].copy() for key in OF_THE_SENSOR if key in samples.values}
+    kept = [np.zeros(0, dtype=np.int64)]
     for part in _stretches(time):
-        if part.stop - part.start > 1:
-            shifted, remain = remove_lag(time[part], force[part], lag)
+        if part.stop - part.start < 2:
+            continue
+        for key, values in moved.items():
+            shifted, remain = remove_lag(time[part], samples.values[key][part], lag)
             rows = part.start + np.flatnonzero(remain)
-            moved[rows] = shifted
-            kept.append(rows)
-    return moved, np.concatenate(kept) if kept else np.zeros(0, dtype=np.int64)
+            values[rows] = shifted
+        kept.append(rows)
+    which = np.concatenate(kept)
+    if not len(which):
+        raise LogError(
+            f"{source}: expected a log longer than the lag of its force, found a lag of {lag:g} s; change "
+            "log.force.lag"
+        )
+    return replace(samples, values=dict(samples.values) | moved).at(which)
 
 
 def _stretches(time: Array) -> Iterator[slice]:

@@ -8,11 +8,11 @@ from pathlib import Path
 from bayes_impedance.config import LogConfig
 from bayes_impedance.errors import LogError
 from bayes_impedance.log import InteractionLog
+from bayes_impedance.readers.arrays.hdf5 import open_hdf5
+from bayes_impedance.readers.arrays.matlab import open_mat
+from bayes_impedance.readers.arrays.numpy_archive import open_npz
+from bayes_impedance.readers.bags.messages import open_messages
 from bayes_impedance.readers.cells import readable
-from bayes_impedance.readers.hdf5 import open_hdf5
-from bayes_impedance.readers.matlab import open_mat
-from bayes_impedance.readers.messages import open_messages
-from bayes_impedance.readers.numpy_archive import open_npz
 from bayes_impedance.readers.parquet import open_parquet
 from bayes_impedance.readers.table import Opened
 from bayes_impedance.readers.text import open_text

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +16,10 @@ from bayes_impedance.log import Array, RowNumbers
 from bayes_impedance.readers.cells import labels, numbers
 from bayes_impedance.readers.columns import TIMES
 from bayes_impedance.readers.table import Stream, Table
+from bayes_impedance.readers.times import OF_THE_SENSOR, Part, clock_of, time_of, within
 from bayes_impedance.recording import synchronise as on_one_clock
-from bayes_impedance.recording.clock import ClockReport, StreamClock, choose_clock
+from bayes_impedance.recording.clock import ClockReport, StreamClock
+from bayes_impedance.recording.wrench import rotations
 
 LABELS = ("trial", "group", "repetition")
 #: What is measured by each column that has a unit.
@@ -30,8 +32,9 @@ QUANTITIES: Mapping[str, Quantity] = {
     "perturbation": "force",
     "torque": "torque",
 }
-#: What has the time stamps of `log.columns.force_time`.
-OF_THE_SENSOR = ("force", "torque")
+
+#: Which samples: a slice copies nothing.
+Which = slice | npt.NDArray[np.bool_] | npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -47,19 +50,19 @@ class Samples:
     labels: Mapping[str, npt.NDArray[np.object_]] = field(default_factory=dict)
     clocks: Mapping[str, ClockReport] = field(default_factory=dict)
 
-
-@dataclass(frozen=True)
-class _Part:
-    """Quantities that share a stream and its time stamps; `clock`: the key of their column of time."""
-
-    name: str
-    stream: Stream
-    clock: str
-    keys: tuple[str, ...]
+    def at(self, which: Which) -> Samples:
+        """Some of the samples."""
+        return replace(
+            self,
+            time=self.time[which],
+            rows=RowNumbers(self.rows.word, self.rows.numbers[which]),
+            values={key: value[which] for key, value in self.values.items()},
+            labels={key: marks[which] for key, marks in self.labels.items()},
+        )
 
 
 def read_samples(table: Table, wanted: Mapping[str, tuple[str, ...]], config: LogConfig) -> Samples:
-    """The `wanted` columns of a table within `log.window`, all at the times of position.
+    """The `wanted` columns of a table, all at the times of position, within `log.window` or where a tool is identified.
 
     Warns (LogWarning) where samples of position are left out because another stream has none there.
 
@@ -69,17 +72,17 @@ def read_samples(table: Table, wanted: Mapping[str, tuple[str, ...]], config: Lo
     names = list(dict.fromkeys(name for columns in wanted.values() for name in columns))
     texts = {name for key in LABELS for name in wanted.get(key, ())}
     base, *others = _parts(table, table.load(names, texts), wanted)
-    clock = None if not (table.timed or others) else _clock(table, base, wanted, config)
-    time = _time(table, base.stream, base.clock, wanted, config) if clock is None else clock.time
-    zero = time[0] if table.timed and len(time) else 0.0
-    inside = _window(table, time - zero, config)
+    clock = None if not (table.timed or others) else clock_of(table, base, wanted, config)
+    time = time_of(table, base, wanted, config) if clock is None else clock.time
+    zero = time[0] if table.timed else 0.0
+    inside = _needed(table, time - zero, config, "force" in wanted)
     samples = _values(table, base, wanted, config, inside if clock is None else clock.kept[inside])
     if clock is None:
         return Samples(time[inside], *samples)
     return _merged(table, _Timed(base, clock, *samples), time[inside], zero, others, wanted, config)
 
 
-def _parts(table: Table, streams: Sequence[Stream], wanted: Mapping[str, tuple[str, ...]]) -> list[_Part]:
+def _parts(table: Table, streams: Sequence[Stream], wanted: Mapping[str, tuple[str, ...]]) -> list[Part]:
     """Quantities by stream and clock, those with position first."""
     parts: dict[tuple[int, str], list[str]] = {}
     for key, columns in wanted.items():
@@ -94,7 +97,7 @@ def _parts(table: Table, streams: Sequence[Stream], wanted: Mapping[str, tuple[s
         clock = "force_time" if key in OF_THE_SENSOR and "force_time" in wanted else "time"
         parts.setdefault((own.pop(), clock), []).append(key)
     found = [
-        _Part(f"{streams[i].name or ', '.join(keys)}", streams[i], clock, tuple(keys))
+        Part(f"{streams[i].name or ', '.join(keys)}", streams[i], clock, tuple(keys))
         for (i, clock), keys in parts.items()
     ]
     found.sort(key=lambda part: "position" not in part.keys)
@@ -107,77 +110,40 @@ def _parts(table: Table, streams: Sequence[Stream], wanted: Mapping[str, tuple[s
     return found
 
 
-# --- time ----------------------------------------------------------------------------------------
-
-
-def _time(
-    table: Table, stream: Stream, clock: str, wanted: Mapping[str, tuple[str, ...]], config: LogConfig
-) -> Array:
-    """A column of time, or that of samples at `log.sampling_rate` [s]."""
-    if clock not in wanted:
-        assert config.sampling_rate is not None
-        return np.arange(len(stream.rows.numbers)) / config.sampling_rate
-    (name,) = wanted[clock]
-    if name not in stream.columns:
-        raise LogError(
-            f"{table.where}: expected as many values in {name!r} as in the columns that it times, found another "
-            f"number; name their time stamps in log.columns.{clock}"
-        )
-    return numbers(stream.rows, stream.columns[name], table.where, clock, name) * config.units.scale("time")
-
-
-def _clock(
-    table: Table, part: _Part, wanted: Mapping[str, tuple[str, ...]], config: LogConfig
-) -> StreamClock:
-    stream = part.stream
-    place = f"{table.where}, {part.name}"
-    if stream.sent is not None:
-        return choose_clock(stream.sent, stream.received, config.clock, place)
-    if stream.received is not None:
-        return choose_clock(stream.received, None, config.clock, place)
-    return choose_clock(_time(table, stream, part.clock, wanted, config), None, config.clock, place)
-
-
-def _window(table: Table, time: Array, config: LogConfig) -> npt.NDArray[np.bool_]:
-    start, end = config.window.start, config.window.end
-    inside: npt.NDArray[np.bool_] = (time >= (-np.inf if start is None else start)) & (
-        time < (np.inf if end is None else end)
-    )
+def _needed(table: Table, time: Array, config: LogConfig, forces: bool) -> Which:
+    """The samples within `log.window`, and those that tell the tool."""
+    inside = within(time, config.window)
     if not inside.any():
         raise LogError(
-            f"{table.where}: expected samples within log.window (start {start}, end {end} s), found none, for the "
-            f"file spans {time.min():g} to {time.max():g} s; change log.window"
+            f"{table.where}: expected samples within log.window (start {config.window.start}, end "
+            f"{config.window.end} s), found none, for the file spans {time.min():g} to {time.max():g} s; change "
+            "log.window"
         )
-    return inside
+    tool = config.force.tool
+    if forces and tool is not None and tool.identify is not None:
+        inside |= within(time, tool.identify)
+    return slice(None) if inside.all() else inside
 
 
 # --- values --------------------------------------------------------------------------------------
 
 
 def _values(
-    table: Table,
-    part: _Part,
-    wanted: Mapping[str, tuple[str, ...]],
-    config: LogConfig,
-    which: npt.NDArray[np.bool_] | npt.NDArray[np.int64],
+    table: Table, part: Part, wanted: Mapping[str, tuple[str, ...]], config: LogConfig, which: Which
 ) -> tuple[RowNumbers, dict[str, Array], dict[str, npt.NDArray[np.object_]]]:
     """The numbers of some rows of a part, its values in SI units and its labels."""
     stream = part.stream
     rows = RowNumbers(stream.rows.word, stream.rows.numbers[which])
-    values = {
-        key: _scale(key, config)
-        * np.stack(
-            [numbers(rows, stream.columns[name][which], table.where, key, name) for name in wanted[key]],
-            axis=-1,
-        )
-        for key in part.keys
-        if key not in LABELS
-    }
-    marks = {
-        key: labels(rows, stream.columns[wanted[key][0]][which], table.where, key, wanted[key][0])
-        for key in part.keys
-        if key in LABELS
-    }
+    values, marks = {}, {}
+    for key in part.keys:
+        cells = [(stream.columns[name].iloc[which], name) for name in wanted[key]]
+        if key in LABELS:
+            ((series, name),) = cells
+            marks[key] = labels(rows, series, table.where, key, name)
+        else:
+            columns = [numbers(rows, series, table.where, key, name) for series, name in cells]
+            values[key] = np.stack(columns, axis=-1)
+            values[key] *= _scale(key, config)
     return rows, values, marks
 
 
@@ -199,7 +165,7 @@ def _scale(key: str, config: LogConfig) -> float:
 class _Timed:
     """A part with its clock and what `_values` made of it."""
 
-    part: _Part
+    part: Part
     clock: StreamClock
     rows: RowNumbers
     values: Mapping[str, Array]
@@ -211,36 +177,33 @@ def _merged(
     base: _Timed,
     time: Array,
     zero: float,
-    others: Sequence[_Part],
+    others: Sequence[Part],
     wanted: Mapping[str, tuple[str, ...]],
     config: LogConfig,
 ) -> Samples:
     """Everything at the times of `base`, which begin at `zero` [s]."""
     clocks = {base.part.name: base.clock.report}
-    streams = []
-    for part in others:
-        clock = _clock(table, part, wanted, config)
-        clocks[part.name] = clock.report
-        _, values, _ = _values(table, part, wanted, config, clock.kept)
-        for key, columns in values.items():
-            rotation = config.force.rotation if key == "orientation" else None
-            streams.append(
-                on_one_clock.Stream(
-                    f"{part.name} ({key})", clock.time, columns, rotation, clock.against_recorder
-                )
-            )
     # Rows of the base stand for its columns: they are taken, not interpolated.
     index = np.arange(len(time), dtype=np.float64)[:, None]
-    result = on_one_clock.synchronise(
-        on_one_clock.Stream(base.part.name, time, index, None, base.clock.against_recorder),
-        streams,
-        align=config.clock.align,
-        place=table.where,
-    )
-    for name, count in result.left_out.items():
-        if count:
+    leading = on_one_clock.Stream(base.part.name, time, index, None, base.clock.against_recorder)
+    streams: list[on_one_clock.Stream] = []
+    first_of_part = []
+    for part in others:
+        clock = clock_of(table, part, wanted, config)
+        clocks[part.name] = clock.report
+        near, times = _near(leading, part.name, clock, config)
+        _, values, _ = _values(table, part, wanted, config, clock.kept[near])
+        if "orientation" in values:
+            _check_orientation(table, values["orientation"], config)
+        first_of_part.append(len(streams))
+        for key, columns in values.items():
+            rotation = config.force.rotation if key == "orientation" else None
+            streams.append(on_one_clock.Stream(f"{part.name} ({key})", times, columns, rotation))
+    result = on_one_clock.synchronise(leading, streams, align=False, place=table.where)
+    for part, number in zip(others, first_of_part, strict=True):
+        if count := result.left_out[streams[number].name]:
             warnings.warn(
-                f"{table.where}: {count} samples of {base.part.name} lie in gaps of {name} and are left out",
+                f"{table.where}: {count} samples of {base.part.name} lie in gaps of {part.name} and are left out",
                 LogWarning,
                 stacklevel=2,
             )
@@ -255,3 +218,23 @@ def _merged(
         {key: marks[kept] for key, marks in base.labels.items()},
         clocks,
     )
+
+
+def _near(base: on_one_clock.Stream, name: str, clock: StreamClock, config: LogConfig) -> tuple[slice, Array]:
+    """The samples of another stream that tell something at the times of `base`, and their times on its clock [s]."""
+    other = on_one_clock.Stream(name, clock.time, np.zeros((0, 0)), None, clock.against_recorder)
+    times = on_one_clock.on_clock_of(base, other) if config.clock.align else clock.time
+    # What is averaged reaches half a step of the base beyond it.
+    reach = float(np.median(np.diff(base.time))) if len(base.time) > 1 else 0.0
+    start = max(int(np.searchsorted(times, base.time[0] - reach)) - 1, 0)
+    end = int(np.searchsorted(times, base.time[-1] + reach)) + 1
+    # Streams that do not overlap are refused where they meet.
+    near = slice(start, end) if len(times[start:end]) > 1 else slice(None)
+    return near, times[near]
+
+
+def _check_orientation(table: Table, orientation: Array, config: LogConfig) -> None:
+    try:
+        rotations(orientation, config.force.rotation)
+    except LogError as error:
+        raise LogError(f"{table.where}: {error}") from error

@@ -36,20 +36,32 @@ def read_trials(table: Table, config: LogConfig, require_force: bool) -> Reading
     """
     axes = axes_of(table, config, require_force)
     sensed = read_samples(table, wanted_columns(table, config, axes, require_force), config)
+    sensed = _trial_by_trial(sensed, config)
     samples, preparation = prepare_force(sensed, config, axes, table.source)
-    return Reading(table.source, axes, sensed, preparation, tuple(_trials(table, samples, config)))
+    return Reading(table.source, axes, sensed, preparation, tuple(_trials(table, samples)))
 
 
-def _trials(table: Table, samples: Samples, config: LogConfig) -> list[Trial]:
-    """One trial for each label, its samples in the order of the file even where they lie apart."""
+def _trial_by_trial(samples: Samples, config: LogConfig) -> Samples:
+    """Samples of each trial in a row, in the order of the file, where it says so without those of equal stamps."""
+    codes = np.zeros(len(samples.time), dtype=np.int64)
+    if "trial" in samples.labels:
+        codes = pd.factorize(samples.labels["trial"])[0]
+        if (np.diff(codes) < 0).any():
+            order = np.argsort(codes, kind="stable")
+            samples, codes = samples.at(order), codes[order]
+    if config.clock.duplicates == "drop":
+        same = (np.diff(samples.time, prepend=-np.inf) == 0) & (np.diff(codes, prepend=-1) == 0)
+        samples = samples.at(~same) if same.any() else samples
+    return samples
+
+
+def _trials(table: Table, samples: Samples) -> list[Trial]:
+    """One trial for each label."""
     everything = np.full(len(samples.time), table.trial or "0", dtype=object)
     codes, names = pd.factorize(samples.labels.get("trial", everything))
     trials = []
     for code, name in enumerate(names):
         own: Any = np.flatnonzero(codes == code) if len(names) > 1 else slice(None)
-        if config.clock.duplicates == "drop":
-            new = np.diff(samples.time[own], prepend=-np.inf) != 0
-            own = np.arange(len(samples.time))[own][new]
         groups = list(dict.fromkeys(samples.labels["group"][own])) if "group" in samples.labels else ["0"]
         if len(groups) > 1:
             raise LogError(

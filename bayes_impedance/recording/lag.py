@@ -71,7 +71,11 @@ def estimate_lag(
         (0.01, True)
     """
     added = np.zeros_like(force) if perturbation is None else perturbation
+    if len(time) < 2:
+        return _undetermined(f"expected at least two samples, found {len(time)}")
     step = float(np.median(np.diff(time)))
+    if step <= 0:
+        return _undetermined("expected times that increase, found most that do not")
     parts = list(stretches(time, np.concatenate([force, added, position], axis=1), step))
     found: list[LagEstimate] = []
     shift = 0

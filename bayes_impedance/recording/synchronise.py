@@ -75,8 +75,13 @@ def synchronise(
     Warns (LogWarning) where a clock cannot be mapped.
 
     Raises:
-        LogError: there is no time at which all streams have samples.
+        LogError: the base has less than two samples, or there is no time at which all streams have samples.
     """
+    if len(base.time) < 2:
+        raise LogError(
+            f"{place}: expected at least two samples of {base.name}, found {len(base.time)}; widen log.window, or "
+            "leave the recording out"
+        )
     others = [_known(other, place) for other in others]
     times = [on_clock_of(base, other) if align else other.time for other in others]
     half = 0.5 * float(np.median(np.diff(base.time)))

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bayes_impedance.errors import LogError
-from bayes_impedance.log import Array, named_rows
+from bayes_impedance.log import Array, Integers, named_rows
 
 #: The norm of a quaternion may be off by as much, for few digits in a file.
 NORM_TOLERANCE = 0.01
@@ -77,11 +77,16 @@ class Jumps:
         )
 
 
-def rotation_jumps(rotation: Rotation) -> Jumps | None:
-    """Jumps of the rotation itself: angles that wrap and quaternions that change sign are none."""
+def rotation_jumps(rotation: Rotation, starts: Integers | None = None) -> Jumps | None:
+    """Jumps of the rotation itself: angles that wrap and quaternions that change sign are none.
+
+    The samples `starts` begin a trial, so that they follow upon nothing.
+    """
     if len(rotation) < 2:
         return None
-    turn = (rotation[:-1].inv() * rotation[1:]).magnitude()
+    turn = np.asarray((rotation[:-1].inv() * rotation[1:]).magnitude())
+    if starts is not None:
+        turn[starts[starts > 0] - 1] = 0.0
     jumps = np.flatnonzero(turn > LARGEST_TURN)
     if not len(jumps):
         return None

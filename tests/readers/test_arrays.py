@@ -13,7 +13,8 @@ import scipy.io
 
 from bayes_impedance.config import LogConfig
 from bayes_impedance.errors import LogError
-from bayes_impedance.readers import arrays, read_log, tree
+from bayes_impedance.readers import read_log
+from bayes_impedance.readers.arrays import tables, tree
 from bayes_impedance.readers.read import open_file
 
 Content = dict[str, Any]
@@ -330,11 +331,11 @@ def test_refuses_empty_arrays(tmp_path, name, write):
 
 def test_refuses_more_than_fits(save, monkeypatch):
     path = save({"a": samples(), "b": samples(seed=1)})
-    monkeypatch.setattr(arrays, "LARGEST", 3 * 37 * 7 * 8)
+    monkeypatch.setattr(tables, "LARGEST", 3 * 37 * 7 * 8)
     with pytest.raises(
         LogError, match=r"expected at most .* GB in the columns of a file, found arrays that are"
     ):
-        monkeypatch.setattr(arrays, "LARGEST", 37 * 7 * 8)
+        monkeypatch.setattr(tables, "LARGEST", 37 * 7 * 8)
         read_log(path, FLAT)
 
 

@@ -12,7 +12,8 @@ from message_files import ENDINGS, HIDDEN, START, hidden, write_bag
 from rosbags.rosbag2.storage_mcap import zstd
 
 from bayes_impedance.errors import LogError
-from bayes_impedance.readers import bounded, read_log
+from bayes_impedance.readers import read_log
+from bayes_impedance.readers.bags import bounded
 
 # --- bags that are not what they should be -------------------------------------------------------
 

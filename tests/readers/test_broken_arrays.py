@@ -206,7 +206,7 @@ def test_an_npz_header_that_declares_a_trillion_samples(tmp_path):
 
 
 def test_a_member_that_unpacks_to_gigabytes(tmp_path, monkeypatch):
-    monkeypatch.setattr("bayes_impedance.readers.arrays.LARGEST", 10**8)
+    monkeypatch.setattr("bayes_impedance.readers.arrays.tables.LARGEST", 10**8)
     archive(tmp_path / "log.npz", header((6 * 10**6, 3)) + bytes(6 * 10**6 * 24))
     assert (tmp_path / "log.npz").stat().st_size < 10**6
     refused(tmp_path / "log.npz", "in the columns of a file, found arrays that are declared to take 0.268 GB")

@@ -6,7 +6,8 @@ import pytest
 
 from bayes_impedance.config import LogConfig
 from bayes_impedance.errors import LogError
-from bayes_impedance.readers import hdf5, read_log
+from bayes_impedance.readers import read_log
+from bayes_impedance.readers.arrays import hdf5
 from bayes_impedance.readers.read import open_file
 
 CONFIG = LogConfig.model_validate(

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from message_files import ROS1, ROS2, build
 from rosbags.interfaces import Nodetype
 
-from bayes_impedance.readers.layout import LONGEST_ARRAY, Decoder, MalformedError, Walker
+from bayes_impedance.readers.bags.layout import LONGEST_ARRAY, Decoder, MalformedError, Walker
 
 STORES = {"ros1": ROS1, "little": ROS2, "big": ROS2}
 TYPES = [(form, kind) for form, store in STORES.items() for kind in sorted(store.fielddefs)]

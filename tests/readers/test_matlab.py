@@ -13,8 +13,9 @@ import scipy.io
 
 from bayes_impedance.config import LogConfig
 from bayes_impedance.errors import LogError
-from bayes_impedance.readers import matlab_elements, matlab_hdf5, read_log
-from bayes_impedance.readers.matlab_elements import check_elements
+from bayes_impedance.readers import read_log
+from bayes_impedance.readers.arrays import matlab_elements, matlab_hdf5
+from bayes_impedance.readers.arrays.matlab_elements import check_elements
 
 COLUMNS = {"time": "t", "position": "pos[{index}]", "velocity": None, "force": "F[{index}]"}
 CONFIG = LogConfig.model_validate({"columns": COLUMNS})

@@ -11,8 +11,8 @@ from message_files import ENDINGS, HIDDEN, START, hidden, joint_state, odometry,
 
 from bayes_impedance.config import LogConfig
 from bayes_impedance.errors import LogError
-from bayes_impedance.readers import messages as messages_module
 from bayes_impedance.readers import read_log
+from bayes_impedance.readers.bags import messages as messages_module
 from bayes_impedance.readers.read import open_file
 
 POSE = ("/pose.pose.position.x", "/pose.pose.position.y", "/pose.pose.position.z")

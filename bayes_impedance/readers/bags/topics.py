@@ -9,7 +9,7 @@ from typing import Any
 
 from bayes_impedance.config import Columns, LogConfig
 from bayes_impedance.errors import LogError, LogWarning
-from bayes_impedance.readers.bags import Bag, Topic
+from bayes_impedance.readers.bags.bag import Bag, Topic
 from bayes_impedance.readers.columns import TIMES
 
 #: Where messages hold a quantity. What carries no stamp or frame is taken too, but no Twist: that is a command.

@@ -13,11 +13,11 @@ import pandas as pd
 from bayes_impedance.config import LogConfig
 from bayes_impedance.errors import LogError
 from bayes_impedance.log import AXES, Array, RowNumbers
-from bayes_impedance.readers.bags import Bag, Topic, read_bag
+from bayes_impedance.readers.bags.bag import Bag, Topic, read_bag
+from bayes_impedance.readers.bags.layout import Decoder, MalformedError
+from bayes_impedance.readers.bags.topics import name_columns
 from bayes_impedance.readers.columns import of_axis
-from bayes_impedance.readers.layout import Decoder, MalformedError
 from bayes_impedance.readers.table import Opened, Stream, Table
-from bayes_impedance.readers.topics import name_columns
 
 #: Messages that are decoded at once, and the bytes of them that are held until then.
 BATCH, BATCH_BYTES = 1024, 1 << 22

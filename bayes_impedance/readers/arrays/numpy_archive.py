@@ -11,9 +11,9 @@ from numpy.lib import format as npy
 
 from bayes_impedance.config import LogConfig
 from bayes_impedance.errors import LogError
-from bayes_impedance.readers.arrays import broken_file, open_arrays
+from bayes_impedance.readers.arrays.tables import broken_file, open_arrays
+from bayes_impedance.readers.arrays.tree import Leaf, Selection, Tree, Values, branch, count_array
 from bayes_impedance.readers.table import Opened
-from bayes_impedance.readers.tree import Leaf, Selection, Tree, Values, branch, count_array
 
 EXPECTED = "a NumPy archive"
 

@@ -11,11 +11,11 @@ import scipy.io
 from scipy.io.matlab import MatlabFunction, MatlabOpaque, matfile_version
 
 from bayes_impedance.config import LogConfig
-from bayes_impedance.readers import matlab_hdf5
-from bayes_impedance.readers.arrays import broken_file, open_arrays
-from bayes_impedance.readers.matlab_elements import check_elements
+from bayes_impedance.readers.arrays import matlab_hdf5
+from bayes_impedance.readers.arrays.matlab_elements import check_elements
+from bayes_impedance.readers.arrays.tables import broken_file, open_arrays
+from bayes_impedance.readers.arrays.tree import TEXT, Elements, Leaf, Tree, Values, count_array
 from bayes_impedance.readers.table import Opened
-from bayes_impedance.readers.tree import TEXT, Elements, Leaf, Tree, Values, count_array
 
 EXPECTED = "a MATLAB file"
 

@@ -11,9 +11,9 @@ import h5py
 import numpy as np
 
 from bayes_impedance.config import LogConfig
-from bayes_impedance.readers.arrays import LARGEST, broken_file, open_arrays
+from bayes_impedance.readers.arrays.tables import LARGEST, broken_file, open_arrays
+from bayes_impedance.readers.arrays.tree import TEXT, Leaf, Selection, Tree, Values, branch, count_array
 from bayes_impedance.readers.table import Opened
-from bayes_impedance.readers.tree import TEXT, Leaf, Selection, Tree, Values, branch, count_array
 
 EXPECTED = "an HDF5 file"
 OPAQUE = np.dtype("V8")

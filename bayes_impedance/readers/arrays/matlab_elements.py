@@ -11,7 +11,7 @@ import struct
 import zlib
 from typing import NamedTuple
 
-from bayes_impedance.readers.arrays import LARGEST
+from bayes_impedance.readers.arrays.tables import LARGEST
 
 HEADER = 128
 #: Types of elements.

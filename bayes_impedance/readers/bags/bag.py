@@ -13,9 +13,9 @@ from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
 from bayes_impedance.errors import LogError
-from bayes_impedance.readers.bounded import BoundedPath, bound_chunks
+from bayes_impedance.readers.bags.bounded import BoundedPath, bound_chunks
+from bayes_impedance.readers.bags.layout import Definitions, Layout, MalformedError, Walker
 from bayes_impedance.readers.cells import brief
-from bayes_impedance.readers.layout import Definitions, Layout, MalformedError, Walker
 
 bound_chunks()
 

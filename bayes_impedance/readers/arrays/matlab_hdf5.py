@@ -8,8 +8,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from bayes_impedance.readers.hdf5 import array_of
-from bayes_impedance.readers.tree import TEXT, Elements, Leaf, Selection, Tree, Values, count_array
+from bayes_impedance.readers.arrays.hdf5 import array_of
+from bayes_impedance.readers.arrays.tree import TEXT, Elements, Leaf, Selection, Tree, Values, count_array
 
 #: Deeper than any struct; references can go round in circles.
 DEEPEST = 16

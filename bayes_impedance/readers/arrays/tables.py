@@ -16,10 +16,10 @@ import pandas as pd
 from bayes_impedance.config import LogConfig
 from bayes_impedance.errors import LogError
 from bayes_impedance.log import AXES, RowNumbers
+from bayes_impedance.readers.arrays.tree import Column, Leaf, Tree, Values, at, columns_of, leaves, recordings
 from bayes_impedance.readers.cells import brief
 from bayes_impedance.readers.columns import of_axis
 from bayes_impedance.readers.table import Opened, Stream, Table
-from bayes_impedance.readers.tree import Column, Leaf, Tree, Values, at, columns_of, leaves, recordings
 
 #: Bytes of one file that are read: 500 million numbers, a day of six columns at 1 kHz.
 LARGEST = 4 * 2**30

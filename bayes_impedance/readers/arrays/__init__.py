@@ -1,0 +1,1 @@
+"""Files of named arrays: NumPy, HDF5, MATLAB."""

@@ -1,0 +1,1 @@
+"""Files of messages: ROS 1 and ROS 2, without ROS."""
