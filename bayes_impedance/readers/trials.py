@@ -36,8 +36,7 @@ def read_trials(table: Table, config: LogConfig, require_force: bool) -> Reading
     """
     axes = axes_of(table, config, require_force)
     sensed = read_samples(table, wanted_columns(table, config, axes, require_force), config)
-    sensed = _trial_by_trial(sensed, config)
-    samples, preparation = prepare_force(sensed, config, axes, table.source)
+    samples, preparation = prepare_force(_trial_by_trial(sensed, config), config, axes, table.source)
     return Reading(table.source, axes, sensed, preparation, tuple(_trials(table, samples)))
 
 

@@ -77,6 +77,8 @@ def test_equal_stamps_in_a_table_are_refused_or_dropped(tmp_path: Path) -> None:
         read(file)
     reading = read(file, clock={"duplicates": "drop"})
     assert [trial.n_samples for trial in reading.trials] == [400, 400]
+    # Whoever inspects the file wants to know of them.
+    assert len(reading.sensed.time) == 816
     for trial in reading.trials:
         np.testing.assert_array_equal(trial.force, force_at(LINE))
 
