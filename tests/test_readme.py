@@ -119,6 +119,18 @@ def test_quoted_figures_are_those_of_the_results() -> None:
             for latent in ("force", "desired_position")
         ),
     ]
+    reading = figures_of("reading")
+    traced = reading["panda_comanipulation"]["left_out_in_turn"]["axes"]
+    quoted += [
+        ", ".join(f"{traced[axis][model]['msll']:.2f}" for axis in "xy") for model in ("impedance", "naive")
+    ]
+    quoted += [
+        ", ".join(f"{traced[axis][model]['coverage90']:.0%}" for axis in "xy")
+        for model in ("impedance", "naive")
+    ]
+    losses = [traced[axis][model]["smse"] for axis in "xy" for model in ("impedance", "naive")]
+    quoted += [f"SMSE {min(losses):.1f} to {max(losses):.1f}"]
+    quoted += [", ".join(f"{reading['gp_mpc'][f'rail/{run}']['pooled_r_squared']:.2f}" for run in (1, 2, 3))]
     rivals = ("ensemble_coupled", "recursive_least_squares", "extended_kalman_filter")
     for task in ("flower", "figure_eight"):
         for model in ("impedance", "naive", *rivals):

@@ -157,7 +157,7 @@ def dump_config(config: Config) -> str:
 
 def as_yaml(content: Mapping[str, Any]) -> str:
     """Plain mappings as the text of a configuration."""
-    return yaml.safe_dump(dict(content), sort_keys=False, allow_unicode=True)
+    return yaml.safe_dump(dict(content), sort_keys=False)
 
 
 def _override(content: dict[str, Any], assignment: str) -> dict[str, Any]:

@@ -33,6 +33,9 @@ QUANTITIES: Mapping[str, Quantity] = {
     "torque": "torque",
 }
 
+#: Of the samples of position: more that lie outside another stream are worth a word.
+LARGEST_SHARE_OUTSIDE = 0.05
+
 #: Which samples: a slice copies nothing.
 Which = slice | npt.NDArray[np.bool_] | npt.NDArray[np.int64]
 
@@ -207,6 +210,13 @@ def _merged(
                 LogWarning,
                 stacklevel=2,
             )
+    if result.outside > LARGEST_SHARE_OUTSIDE * len(time):
+        warnings.warn(
+            f"{table.where}: {result.outside} of {len(time)} samples of {base.part.name} lie before or after those of "
+            f"{', '.join(part.name for part in others)} and are left out",
+            LogWarning,
+            stacklevel=2,
+        )
     kept = result.rows
     values = {key: columns[kept] for key, columns in base.values.items()}
     keys = [key for part in others for key in part.keys]

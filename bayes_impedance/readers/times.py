@@ -68,13 +68,18 @@ def clock_of(
     """The clock of a part of a file where there are several, or messages.
 
     Raises:
-        LogError: times go back, repeat where that is refused, or are less than two.
+        LogError: times go back, repeat where that is refused, are less than two, or stamps asked for are not there.
     """
     stream = part.stream
     place = f"{table.where}, {part.name}"
     if stream.sent is not None:
         return choose_clock(stream.sent, stream.received, config.clock, place)
     if stream.received is not None:
+        if config.clock.source == "header":
+            raise LogError(
+                f"{place}: expected messages with the stamps of their sender, as log.clock.source: header asks, found "
+                "none that are set; set it to auto or record"
+            )
         clock = choose_clock(stream.received, None, config.clock, place)
         report = replace(clock.report, source="record", why="messages carry no stamp of their sender")
         return replace(clock, report=report, against_recorder=RECORDER)

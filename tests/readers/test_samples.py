@@ -431,3 +431,25 @@ def test_a_plain_log_is_not_copied_by_what_it_does_not_need(tmp_path: Path) -> N
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert read_log(tmp_path / "log.npz").n_samples == 400
+
+
+# --- what a file cannot give ---------------------------------------------------------------------
+
+
+def test_stamps_of_a_sender_that_are_asked_for_and_are_not_there(tmp_path):
+    position = poses(LINE, LINE, position_at(LINE))
+    path = bag(tmp_path / "log.bag", position, forces(LINE + 0.004, force_at(LINE)))
+    with pytest.raises(
+        LogError, match="expected messages with the stamps of their sender, as log.clock.source"
+    ):
+        read(path, clock={"source": "header"})
+
+
+def test_most_of_a_recording_without_force_is_said_to_be_left_out(tmp_path):
+    half = LINE[LINE < 2.0]
+    path = bag(
+        tmp_path / "log.bag", poses(LINE, LINE, position_at(LINE)), wrenches(half, half, force_at(half))
+    )
+    with pytest.warns(LogWarning, match="samples of /pose lie before or after those of /ft and are left out"):
+        trial = only(read(path))
+    assert trial.time[-1] == pytest.approx(half[-1])
