@@ -135,13 +135,18 @@ def _trial_table(prepared: PreparedLog) -> Table:
         "What the model would see", "trial", "group", "samples", "duration [s]", "repetitions", "phase"
     )
     for trial in prepared.trials[:LONGEST_TABLE]:
-        phase = "" if trial.phase is None else f"{trial.phase[0]:.3f} … {trial.phase[-1]:.3f}"
+        phase = "" if trial.phase is None else f"{_plain(trial.phase[0])} … {_plain(trial.phase[-1])}"
         table.add_row(
             escape(f"{trial.source}, {trial.name}"), escape(trial.group), str(trial.n_samples),
             f"{np.ptp(trial.time):.2f}", str(len(np.unique(trial.repetition))), phase,
         )  # fmt: skip
     _count_rest(table, len(prepared.trials))
     return table
+
+
+def _plain(phase: float) -> str:
+    # The smoother may leave it a hair under zero.
+    return f"{abs(phase) if abs(phase) < 5e-4 else phase:.3f}"
 
 
 def _smoother_table(inspection: Inspection) -> Table:

@@ -191,8 +191,8 @@ def _text(
     listed = [*remarks, *inspection.repairs, *(finding.sentence for finding in inspection.findings)]
     lines += ["", "What looks wrong:", *(f"- {sentence}" for sentence in listed)] if listed else []
     head = "\n".join(f"# {line}".rstrip() for line in lines)
-    ordered = {key: content[key] for key in ("extends", "log", "preprocessing") if key in content}
-    ordered |= {key: value for key, value in content.items() if key not in ordered}
+    ordered = {key: content[key] for key in ("extends", "log", "preprocessing") if content.get(key)}
+    ordered |= {key: value for key, value in content.items() if value and key not in ordered}
     body = as_yaml(ordered) if ordered else "{}\n"
     return f"{head}\n\n{body}{_device(inspection)}"
 
