@@ -14,10 +14,10 @@ these data, weakly, or prior only.
 
 Two levels:
 
-- High: `read_log` and `load_config` take in data and choices; `ImpedanceModel` fits, gives a `Posterior` of every
-  `Latent` and a `Verdict` on every impedance; `evaluate` scores it on another log, `cross_validate` on parts of its
-  own; `prior_sensitivity` tells what rests on a prior; `save_model` and `load_model` keep it. Each failure that input
-  can cause is a `BayesImpedanceError`.
+- High: `inspect_recordings` says what is in files and what looks wrong; `read_log` and `load_config` take in data and
+  choices; `ImpedanceModel` fits, gives a `Posterior` of every `Latent` and a `Verdict` on every impedance; `evaluate`
+  scores it on another log, `cross_validate` on parts of its own; `prior_sensitivity` tells what rests on a prior;
+  `save_model` and `load_model` keep it. Each failure that input can cause is a `BayesImpedanceError`.
 - Under it: `bayes_impedance.kernels` are ordinary gpytorch kernels (`ImpedanceKernel`, `PDKernel`,
   `InteractionKernel`) for models of one's own; `bayes_impedance.engines` computes exact likelihoods with them.
 
@@ -32,6 +32,8 @@ from bayes_impedance.evaluation.explained import impedance_share as impedance_sh
 from bayes_impedance.evaluation.held_out import evaluate as evaluate
 from bayes_impedance.identifiability import Support as Support
 from bayes_impedance.identifiability import Verdict as Verdict
+from bayes_impedance.inspection.inspect import Inspection as Inspection
+from bayes_impedance.inspection.inspect import inspect_recordings as inspect_recordings
 from bayes_impedance.kernels.impedance import Latent as Latent
 from bayes_impedance.log import InteractionLog as InteractionLog
 from bayes_impedance.model import ImpedanceModel as ImpedanceModel
