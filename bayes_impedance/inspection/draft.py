@@ -12,7 +12,7 @@ import pandas as pd
 
 from bayes_impedance.config import Columns, LogConfig, as_yaml, parse_config
 from bayes_impedance.errors import LogError
-from bayes_impedance.inspection.findings import Repeated
+from bayes_impedance.inspection.findings import InRecording
 from bayes_impedance.inspection.guess import (
     guess_columns,
     guess_length_unit,
@@ -157,7 +157,7 @@ def _add_repairs(content: dict[str, Any], inspection: Inspection) -> None:
     log = content["log"]
     if any(clock.duplicates for clock in inspection.clocks.values()):
         log["clock"] = {"duplicates": "drop"}
-    found = [f.first if isinstance(f, Repeated) else f for f in inspection.findings]
+    found = [f.first if isinstance(f, InRecording) else f for f in inspection.findings]
     if any(isinstance(finding, (VelocityMismatch, VelocityUnrelated)) for finding in found):
         log["columns"] = {**log.get("columns", {}), "velocity": None}
     preprocessing: dict[str, Any] = {}

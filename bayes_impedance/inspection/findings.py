@@ -63,26 +63,34 @@ def look_at(reading: Reading) -> list[Finding]:
 
 
 @dataclass(frozen=True)
-class Repeated:
-    """What looks wrong with one channel in `count` recordings; `first` as it is in one of them."""
+class InRecording:
+    """What looks wrong with one of several recordings, `first`, and with `count` of them alike."""
 
     first: Finding
+    source: str
     count: int
 
     @property
     def sentence(self) -> str:
-        """That of the first, and in how many others."""
-        return f"{self.first.sentence} ({self.count} recordings)"
+        """In which recording, and in how many."""
+        others = f", and so in {self.count} recordings" if self.count > 1 else ""
+        return f"{self.source}{others}: {self.first.sentence}"
 
 
-def gathered(by_recording: Sequence[Sequence[Finding]]) -> list[Finding]:
-    """Findings of several recordings, of one kind and channel only once."""
-    alike: dict[tuple[type, str], list[Finding]] = {}
-    for findings in by_recording:
+def gathered(by_recording: Sequence[tuple[str, Sequence[Finding]]]) -> list[Finding]:
+    """Findings of several recordings, each with its source, of one kind and channel only once."""
+    alike: dict[tuple[type, str], list[tuple[str, Finding]]] = {}
+    for source, findings in by_recording:
         for finding in findings:
+            # A sentence without a channel names its recording itself.
             channel = getattr(finding, "channel", None) or finding.sentence
-            alike.setdefault((type(finding), channel), []).append(finding)
-    return [own[0] if len(own) == 1 else Repeated(own[0], len(own)) for own in alike.values()]
+            alike.setdefault((type(finding), channel), []).append((source, finding))
+    if len(by_recording) == 1:
+        return [own[0][1] for own in alike.values()]
+    return [
+        own[0][1] if isinstance(own[0][1], Remark) else InRecording(own[0][1], own[0][0], len(own))
+        for own in alike.values()
+    ]
 
 
 def middle_of(samples: Samples) -> Samples:

@@ -84,7 +84,7 @@ def _as_read(result: Inspection, opened: Sequence[Opened]) -> tuple[Inspection, 
     readings = [reading for file in opened for reading in read_tables(file, require_force=False)]
     clocks = _clocks(readings)
     found = [finding for name, clock in clocks.items() for finding in of_clock(name, clock)]
-    found += gathered([look_at(reading) for reading in readings])
+    found += gathered([(reading.source, look_at(reading)) for reading in readings])
     known = {reading.source: reading.preparation for reading in readings}
     result = replace(result, findings=tuple(found), clocks=clocks, preparations=known)
     return result, as_log(readings)

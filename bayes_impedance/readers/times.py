@@ -73,7 +73,7 @@ def clock_of(
     stream = part.stream
     place = f"{table.where}, {part.name}"
     if stream.sent is not None:
-        return choose_clock(stream.sent, stream.received, config.clock, place)
+        return _from_zero(choose_clock(stream.sent, stream.received, config.clock, place))
     if stream.received is not None:
         if config.clock.source == "header":
             raise LogError(
@@ -82,7 +82,7 @@ def clock_of(
             )
         clock = choose_clock(stream.received, None, config.clock, place)
         report = replace(clock.report, source="record", why="messages carry no stamp of their sender")
-        return replace(clock, report=report, against_recorder=RECORDER)
+        return _from_zero(replace(clock, report=report, against_recorder=RECORDER))
     time = time_of(table, part, wanted, config)
     back = np.flatnonzero(np.diff(time) < 0)
     if len(back):
@@ -93,6 +93,12 @@ def clock_of(
             "null"
         )
     return choose_clock(time, None, config.clock, place)
+
+
+def _from_zero(clock: StreamClock) -> StreamClock:
+    """Gaps as they lie in the log, whose time begins with the first message; the clock itself as it was."""
+    gaps = tuple((start - clock.time[0], length) for start, length in clock.report.gaps)
+    return replace(clock, report=replace(clock.report, gaps=gaps))
 
 
 def within(time: Array, window: Window) -> npt.NDArray[np.bool_]:
