@@ -98,7 +98,9 @@ def _aligned(trial: PreparedTrial, reference: Array, knots: int) -> PreparedTria
 def _bend(path: Array, reference: Array, knots: int) -> BSpline[np.float64]:
     """Strictly increasing h with h(0) = 0, h(1) = 1 and `path` at s near `reference` at h(s)."""
     # Positions as they are: all axes are metres, and an axis that hardly moves must not count as much as the others.
-    pairs = np.array(dtw_ndim.warping_path(path, reference, use_c=True))
+    # The library refuses vectors of one component: a second one that is zero leaves distances as they are.
+    both = (np.pad(positions, ((0, 0), (0, 1))) for positions in (path, reference))
+    pairs = np.array(dtw_ndim.warping_path(*both, use_c=True))
     own, other = PLACES[pairs[:, 0]], PLACES[pairs[:, 1]]
     return _monotone(own, other, knots)
 

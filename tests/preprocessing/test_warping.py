@@ -81,6 +81,24 @@ def test_noise_bends_little(name):
     assert np.sqrt(np.mean((bent.phase - BENDS[name](log.trials[1].phase)) ** 2)) < 2 * 1e-3 / 0.3
 
 
+@pytest.mark.parametrize("n_axes", [1, 3])
+def test_one_and_three_axes_are_aligned_as_two_are(n_axes):
+    """An axis that rests changes nothing; a reach along one axis is told by that alone."""
+
+    def of(log, chosen):
+        trials = tuple(
+            replace(t, **{k: chosen(getattr(t, k)) for k in ("position", "velocity", "acceleration", "jerk")})
+            for t in log.trials
+        )
+        return PreparedLog(("x", "y", "z")[:n_axes], trials)
+
+    log = pair(BENDS["ahead"])
+    changed = of(log, lambda v: v[:, 1:] if n_axes == 1 else np.pad(v, ((0, 0), (0, 1))))
+    alike = of(log, lambda v: np.pad(v[:, 1:], ((0, 0), (0, 1)))) if n_axes == 1 else log
+    phases = [align(each, WARPING).trials[1].phase for each in (changed, replace(alike, axes=("x", "y")))]
+    np.testing.assert_allclose(*phases, atol=1e-12)
+
+
 def test_rates_follow_by_the_chain_rule():
     bent = align(pair(BENDS["ahead"], n=4000), PhaseConfig(source="warping", reference="reference")).trials[1]
     inner = slice(2, -2)
