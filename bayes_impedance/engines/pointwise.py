@@ -71,6 +71,8 @@ class PointPredictor:
         self._residual_variance = sum(part.variance for part in residual_parts)
         self._labels = None if self._layout.residual is None else inputs[:, self._layout.residual]
         self._errors = [inputs[:, c] for c in self._layout.error] or None
+        self._motion_noise = kernel.motion_noise
+        self._inputs = observations.inputs
         self._loop: LoopEvidence | None = None
         if loop is not None:
             self._loop = LoopEvidence(impedance, factor, observations, loop)
@@ -93,6 +95,11 @@ class PointPredictor:
             )
         prior = self._residual_variance
         prior += force_covariance(weights, weights, self._variances, own_table, own, errors, errors)
+        if self._motion_noise is not None:
+            with torch.no_grad():
+                here = torch.from_numpy(x).unsqueeze(0)
+                cross = cross + self._motion_noise.forward(here, self._inputs)[0].numpy()
+                prior += float(self._motion_noise.forward(here, here, diag=True))
         # On one thread, unlike a product with the inverse: waking another can cost milliseconds.
         white = dtrsv(self._cholesky, cross, lower=1)
         mean = cross @ self._alpha
