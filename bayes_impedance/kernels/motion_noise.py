@@ -123,7 +123,7 @@ class MotionNoiseKernel(BatchedKernel):
     def _overlaps(self, one: _Smoothing, two: _Smoothing) -> tuple[Tensor, Tensor]:
         """Where pairs of samples stand in a table of S_ij/σ_x² `(pairs, 3, 3)` [s^−(i + j)]; its row 0 is zero."""
         lag = two.first - one.first
-        near = (one.trial == two.trial) & (lag.abs() < one.length)
+        near = (one.trial == two.trial) & (one.length == two.length) & (lag.abs() < one.length)
         which = torch.zeros(near.shape, dtype=torch.long)
         tables = [one.trial.new_zeros(1, 3, 3)]
         filters = torch.stack(
