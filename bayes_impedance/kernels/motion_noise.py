@@ -90,84 +90,86 @@ class MotionNoiseKernel(BatchedKernel):
 
     def forward(self, x1: Tensor, x2: Tensor, diag: bool = False, **params: object) -> Tensor:
         """N, `(..., n1, n2)`, or `(..., n)` with `diag` [N²]."""
-        one, two = self._smoothing(x1), self._smoothing(x2)
         if diag:
-            which, table = self._overlaps(one, two)
-            total = self._sum(
-                [process.expectation(x1)[..., 0] for process in self.processes],
-                [process.expectation(x2)[..., 0] for process in self.processes],
-                [process.forward(x1, x2, diag=True) for process in self.processes],
-                table[which],
-            )
+            moments = [
+                (
+                    process.expectation(x1)[..., 0],
+                    process.expectation(x2)[..., 0],
+                    process.forward(x1, x2, diag=True),
+                )
+                for process in self.processes
+            ]
+            total = self._sum(moments, self._smoothed(self._smoothing(x1), self._smoothing(x2)))
             return total * self.sd[..., 0].square()
-        one = _Smoothing(*(column.unsqueeze(-1) for column in one))
-        two = _Smoothing(*(column.unsqueeze(-2) for column in two))
-        which, table = self._overlaps(one, two)
-        # N is zero but near the diagonal of each trial: moments are formed there alone.
-        near = which.reshape(-1, *which.shape[-2:]).any(0)
-        rows, columns = near.any(1).nonzero()[:, 0], near.any(0).nonzero()[:, 0]
-        moments = [
-            process.moments(x1.index_select(-2, rows), x2.index_select(-2, columns))
-            for process in self.processes
-        ]
-        inside = which.index_select(-2, rows).index_select(-1, columns)
-        expectation1, expectation2, covariance = zip(*moments, strict=True)
-        block = self._sum(expectation1, expectation2, covariance, table[inside]) * self.sd.square()
-        total = block.new_zeros(*block.shape[:-2], *near.shape)
+        # N is zero but near the diagonal of each trial: all else is left out.
+        near = _near(*self._pairs(x1, x2))
+        anywhere = near.reshape(-1, *near.shape[-2:]).any(0)
+        rows, columns = anywhere.any(1).nonzero()[:, 0], anywhere.any(0).nonzero()[:, 0]
+        one, two = x1.index_select(-2, rows), x2.index_select(-2, columns)
+        moments = [process.moments(one, two) for process in self.processes]
+        block = self._sum(moments, self._smoothed(*self._pairs(one, two))) * self.sd.square()
+        total = block.new_zeros(*block.shape[:-2], *anywhere.shape)
         total[..., rows.unsqueeze(-1), columns] = block
         return total
 
     def _smoothing(self, x: Tensor) -> _Smoothing:
         return _Smoothing(*(x[..., column] for column in self.columns))
 
-    def _overlaps(self, one: _Smoothing, two: _Smoothing) -> tuple[Tensor, Tensor]:
-        """Where pairs of samples stand in a table of S_ij/σ_x² `(pairs, 3, 3)` [s^−(i + j)]; its row 0 is zero."""
+    def _pairs(self, x1: Tensor, x2: Tensor) -> tuple[_Smoothing, _Smoothing]:
+        one, two = self._smoothing(x1), self._smoothing(x2)
+        return _Smoothing(*(c.unsqueeze(-1) for c in one)), _Smoothing(*(c.unsqueeze(-2) for c in two))
+
+    def _smoothed(self, one: _Smoothing, two: _Smoothing) -> Tensor:
+        """S_ij/σ_x² of pairs of samples, `(..., 3, 3)` [s^−(i + j)]."""
+        near = _near(one, two)
         lag = two.first - one.first
-        near = (one.trial == two.trial) & (one.length == two.length) & (lag.abs() < one.length)
         which = torch.zeros(near.shape, dtype=torch.long)
-        tables = [one.trial.new_zeros(1, 3, 3)]
+        # Pairs that are not near take the first row.
+        tables = [lag.new_zeros(1, 3, 3)]
         filters = torch.stack(
-            [c.reshape(-1) for c in (one.length, one.order, one.step, one.from_positions)], -1
+            [c.flatten() for c in (one.length, one.order, one.step, one.from_positions)], -1
         )
         for length, order, step, from_positions in filters.unique(dim=0).tolist():
-            if length == 0:
-                continue
             same = (one.length == length) & (one.order == order) & (one.step == step)
             chosen = near & same & (one.from_positions == from_positions)
-            pairs = torch.stack([part.expand(near.shape)[chosen] for part in (one.place, two.place, lag)], -1)
+            if not chosen.any():
+                continue
             # Few differ: within a trial the place is the middle, and the lags are those of one window.
-            pairs, index = pairs.long().unique(dim=0, return_inverse=True)
+            code = ((one.place * length + two.place) * 2 + 1) * length + lag
+            codes, index = code[chosen].long().unique(return_inverse=True)
             which[chosen] = index + sum(len(table) for table in tables)
             weights = self.weights(int(length), int(order), step)[: int(from_positions)]
-            table = torch.zeros(len(pairs), 3, 3, dtype=torch.float64)
-            size = len(weights)
-            table[:, :size, :size] = torch.from_numpy(_shared(weights, *pairs.numpy().T))
-            tables.append(table.to(one.trial))
-        return which, torch.cat(tables)
+            table = lag.new_zeros(len(codes), 3, 3)
+            table[:, : len(weights), : len(weights)] = torch.from_numpy(_shared(weights, codes.numpy()))
+            tables.append(table)
+        return torch.cat(tables)[which]
 
     @staticmethod
-    def _sum(
-        expectation1: Sequence[Tensor],
-        expectation2: Sequence[Tensor],
-        covariance: Sequence[Tensor],
-        table: Tensor,
-    ) -> Tensor:
+    def _sum(moments: Sequence[tuple[Tensor, Tensor, Tensor]], smoothed: Tensor) -> Tensor:
         """Σ_ij (E_i E_j' + C_ij) S_ij."""
-        total = torch.zeros((), dtype=table.dtype)
-        for i, e1 in enumerate(expectation1):
-            for j, e2 in enumerate(expectation2):
-                weight = e1 * e2 + covariance[i] if i == j else e1 * e2
-                total = total + weight * table[..., i, j]
+        total = torch.zeros((), dtype=smoothed.dtype)
+        for i, (e1, _, covariance) in enumerate(moments):
+            for j, (_, e2, _) in enumerate(moments):
+                weight = e1 * e2 + covariance if i == j else e1 * e2
+                total = total + weight * smoothed[..., i, j]
         return total
 
 
-def _shared(
-    weights: NDArray[np.float64], place1: NDArray[np.int64], place2: NDArray[np.int64], lag: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Σ_n c⁽ⁱ⁾(n) c⁽ʲ⁾(n) over the samples of two windows, the second begun `lag` later, `(pairs, orders, orders)`."""
+def _near(one: _Smoothing, two: _Smoothing) -> Tensor:
+    """Whether the windows of two samples share some."""
+    return (one.trial == two.trial) & ((two.first - one.first).abs() < torch.minimum(one.length, two.length))
+
+
+def _shared(weights: NDArray[np.float64], codes: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Σ_n c⁽ⁱ⁾(n) c⁽ʲ⁾(n) over the samples that two windows share, `(pairs, orders, orders)`.
+
+    A code is ((place · length + other place) · 2 + 1) · length + lag, by which the second window begins later.
+    """
     length = weights.shape[-1]
-    in_second = np.arange(length) - lag[:, None]
-    held = (in_second >= 0) & (in_second < length)
+    places, lag = np.divmod(codes, 2 * length)
+    place1, place2 = np.divmod(places, length)
+    in_second = np.arange(length) - (lag - length)[:, None]
+    shared = (in_second >= 0) & (in_second < length)
     one = weights[:, place1]
-    two = weights[:, place2[:, None], np.where(held, in_second, 0)] * held
+    two = weights[:, place2[:, None], np.where(shared, in_second, 0)] * shared
     return np.einsum("ipn,jpn->pij", one, two, optimize=True)

@@ -99,8 +99,7 @@ def test_orders_that_do_not_come_from_positions_bring_no_noise() -> None:
         x = rows(smooth, 40, orders=orders)
         # What is logged by the robot has the weight 0.
         known = tuple(
-            spec if order < orders else ProcessSpec("gaussian", 0.0, 0.0)
-            for order, spec in enumerate(SPECS)
+            spec if order < orders else ProcessSpec("gaussian", 0.0, 0.0) for order, spec in enumerate(SPECS)
         )
         expected = noise_of(smooth, 40, 1, known, x[:, XI])
         assert relative_error(kernel_of()(x).to_dense(), expected) < 1e-12
@@ -113,7 +112,9 @@ def test_trials_are_independent_and_each_has_its_own_filter() -> None:
     with torch.no_grad():
         joint = kernel(torch.cat([one, two, padding])).to_dense()
         expected = torch.block_diag(kernel(one).to_dense(), kernel(two).to_dense(), padding[:, :4])
+        variances = kernel(torch.cat([one, two, padding]), diag=True)
     torch.testing.assert_close(joint, expected, rtol=1e-13, atol=0.0)
+    torch.testing.assert_close(variances, expected.diagonal(), rtol=1e-13, atol=0.0)
 
 
 def test_equals_the_covariance_of_filtered_noise_times_drawn_impedance() -> None:
@@ -139,7 +140,9 @@ def test_equals_the_covariance_of_filtered_noise_times_drawn_impedance() -> None
 
 def test_positive_semidefinite_with_any_thinning() -> None:
     for every in (1, 2, 7):
-        x = torch.cat([rows(SavitzkyGolay(21, 4, 0.005), 120, trial, every, seed=int(trial)) for trial in (0.0, 1.0)])
+        x = torch.cat(
+            [rows(SavitzkyGolay(21, 4, 0.005), 120, trial, every, seed=int(trial)) for trial in (0.0, 1.0)]
+        )
         with torch.no_grad():
             value = kernel_of()(x).to_dense()
         torch.testing.assert_close(value, value.T, rtol=1e-12, atol=0.0)
