@@ -10,7 +10,7 @@ S_ij(s,t) = Cov[η̂⁽ⁱ⁾(s), η̂⁽ʲ⁾(t)] = σ_x² Σ_n c⁽ⁱ⁾_s(n)
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -48,13 +48,14 @@ class MotionNoiseKernel(BatchedKernel):
         columns: seven columns of the input: label of the trial, first native sample of the window that serves the
             sample, its place in it, length of the window (0: no noise), order of the polynomial, native step [s], and
             how many of position, velocity and acceleration come from the recorded positions.
-        processes: priors of k, d and m, those of the `ImpedanceKernel`.
+        processes: priors of k, d and m, those of the `ImpedanceKernel`, whose parts they stay: their hyperparameters are
+            not listed here.
         weights: the filter.
         sd_prior: prior of σ_x.
 
     Example:
         >>> average = lambda length, order, step: np.stack([np.full((length, length), 1.0 / length)] * 3)
-        >>> k, d, m = (ImpedanceProcess(StationaryKernel(num_dims=0), "gaussian") for _ in range(3))
+        >>> k, d, m = (ImpedanceProcess(StationaryKernel(num_dims=0), "gaussian").double() for _ in range(3))
         >>> kernel = MotionNoiseKernel(tuple(range(7)), (k, d, m), average).double()
         >>> k.level, k.covariance.sd, kernel.sd = 300.0, 1e-9, 1e-3
         >>> rows = [[0, first, 1, 3, 0, 0.01, 1] for first in range(4)]  # windows of three samples, positions alone
@@ -75,7 +76,8 @@ class MotionNoiseKernel(BatchedKernel):
             raise ValueError(f"columns: expected {len(_Smoothing._fields)}, got {len(columns)}")
         super().__init__(batch_shape=batch_shape, active_dims=active_dims)
         self.columns = columns
-        self.processes = cast("Sequence[ImpedanceProcess]", torch.nn.ModuleList(processes))
+        # In a tuple they are no modules of this one: gpytorch counts the priors of a module as often as it has parents.
+        self.processes = tuple(processes)
         self.weights = weights
         register_positive(self, "sd", self._batch_shape, sd_prior, None)
 

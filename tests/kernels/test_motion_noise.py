@@ -22,6 +22,7 @@ from bayes_impedance.kernels import (
     StationaryKernel,
 )
 from bayes_impedance.kernels.impedance import Latent
+from bayes_impedance.kernels.stationary import BatchedKernel
 from bayes_impedance.preprocessing.savitzky_golay import SavitzkyGolay, motion_weights
 
 COLUMNS = tuple(range(7))
@@ -33,12 +34,27 @@ SPECS = (
     ProcessSpec("gaussian", 1.3, 0.3),
 )
 NOISE = 2e-4
+NO_BATCH = torch.Size()
 
 
-def kernel_of(specs: tuple[ProcessSpec, ...] = SPECS, sd: float = NOISE) -> MotionNoiseKernel:
-    processes = [spec.kernel((XI,) if spec.lengthscale else None) for spec in specs]
-    kernel = MotionNoiseKernel(COLUMNS, processes, motion_weights).double()
-    kernel.sd = double(sd)
+class Alone(BatchedKernel):
+    """The noise with its processes, which elsewhere belong to an ImpedanceKernel."""
+
+    def __init__(
+        self, processes: list[ImpedanceProcess], batch_shape: torch.Size | None = None, **kwargs: Any
+    ) -> None:
+        super().__init__(batch_shape=batch_shape, **kwargs)
+        self.processes = torch.nn.ModuleList(processes)
+        self.noise = MotionNoiseKernel(COLUMNS, processes, motion_weights, batch_shape=batch_shape)
+
+    def forward(self, x1: Tensor, x2: Tensor, diag: bool = False, **params: object) -> Tensor:
+        """The kernel itself."""
+        return self.noise.forward(x1, x2, diag)
+
+
+def kernel_of() -> Alone:
+    kernel = Alone([spec.kernel((XI,) if spec.lengthscale else None) for spec in SPECS]).double()
+    kernel.noise.sd = double(NOISE)
     return kernel
 
 
@@ -182,7 +198,8 @@ def test_part_of_the_force_and_of_nothing_else() -> None:
                 assert torch.equal(*(k.prior_variance(x, latent) for k in (without, carried)))
         more = carried.prior_variance(x, Latent.FORCE) - without.prior_variance(x, Latent.FORCE)
         torch.testing.assert_close(more, noise(x, diag=True), rtol=1e-6, atol=1e-9)
-    # The processes are those of the impedance kernel, not copies: one set of hyperparameters.
+    # One set of hyperparameters, each listed once.
+    assert len(list(carried.parameters())) == len(list(without.parameters())) + 1
     assert {id(p) for p in carried.parameters()} == {id(p) for p in without.parameters()} | {id(noise.raw_sd)}
 
 
@@ -191,7 +208,7 @@ def test_the_number_of_columns_is_checked() -> None:
         MotionNoiseKernel((0, 1), (), motion_weights)
 
 
-class _OnWholeNumbers(MotionNoiseKernel):
+class _OnWholeNumbers(Alone):
     """The battery's data are random reals: here two of their columns say trial and window."""
 
     def forward(self, x1: Tensor, x2: Tensor, diag: bool = False, **params: object) -> Tensor:
@@ -212,9 +229,10 @@ class TestMotionNoise(BaseKernelTestCase, unittest.TestCase):
         super().setUp()
         torch.manual_seed(0)
 
-    def create_kernel_no_ard(self, batch_shape: torch.Size = torch.Size(), **kwargs: Any) -> Kernel:
+    def create_kernel_no_ard(self, batch_shape: torch.Size = NO_BATCH, **kwargs: Any) -> Kernel:
+        """Of constant impedance."""
         processes = []
         for _ in range(3):
             covariance = StationaryKernel(num_dims=0, batch_shape=batch_shape)
             processes.append(ImpedanceProcess(covariance, batch_shape=batch_shape))
-        return _OnWholeNumbers(COLUMNS, processes, motion_weights, batch_shape=batch_shape, **kwargs)
+        return _OnWholeNumbers(processes, batch_shape, **kwargs)
