@@ -49,9 +49,9 @@ def carried(noise: object = NOISE, **model: object) -> Config:
     return parse_config({**config.model_dump(mode="json"), "preprocessing": PREPROCESSING})
 
 
-def recording(trials: int = 2, seed: int = 0) -> InteractionLog:
+def recording(seed: int = 0, axes: tuple[str, ...] = ("x",)) -> InteractionLog:
     """Force from the model and positions with noise, as a logger would have written them."""
-    motion = repeated_motion(trials, duration=0.8, rate=NATIVE, axes=("x",), seed=seed)
+    motion = repeated_motion(2, duration=0.8, rate=NATIVE, axes=axes, seed=seed)
     drawn = as_recording(draw_force(configuration(), motion, seed), keep_reference=True)
     rng = np.random.default_rng(seed)
     noisy = [
@@ -228,23 +228,26 @@ def test_the_closed_loop_has_the_same_jacobian_and_the_wider_covariance(prepared
 
 
 @pytest.mark.parametrize("device", [None, {"mass": 2.0}])
-def test_one_point_equals_the_dense_posterior(prepared, device):
+def test_one_point_equals_the_dense_posterior(device):
     config = parse_config(
         {
-            **carried().model_dump(mode="json"),
+            # Each axis has a value of its own.
+            **carried("{median: 1.0e-4, log_sd: 0.5}").model_dump(mode="json"),
             "device": device,
-            "training": {"restarts": 1, "max_iterations": 1},
+            "training": {"restarts": 1, "max_iterations": 2},
         }
     )
-    model = ImpedanceModel(config).fit(prepared)
-    expected = model.posterior(prepared, given="training")["force"]
-    mean = TrajectoryMean.from_training(config.model.desired_trajectory, prepared)
-    inputs = FeatureMap(config, prepared.axes)(prepared, mean).inputs[0, 0].numpy()
-    predictor = model.point_predictor("x", "0")
-    for row in (0, 7, 19):
-        value, variance = predictor.predict(inputs[row])
-        assert value == pytest.approx(expected.mean[row, 0], rel=1e-8, abs=1e-8)
-        assert np.sqrt(variance) == pytest.approx(expected.sd[row, 0], rel=1e-6)
+    model = ImpedanceModel(config).fit(recording(axes=("x", "y")))
+    log = model.fitted.log
+    expected = model.posterior(log, given="training")["force"]
+    mean = TrajectoryMean.from_training(config.model.desired_trajectory, log)
+    inputs = FeatureMap(config, log.axes)(log, mean).inputs[:, 0].numpy()
+    for axis, name in enumerate(log.axes):
+        predictor = model.point_predictor(name, "0")
+        for row in (0, 7, 19):
+            value, variance = predictor.predict(inputs[axis, row])
+            assert value == pytest.approx(expected.mean[row, axis], rel=1e-8, abs=1e-8)
+            assert np.sqrt(variance) == pytest.approx(expected.sd[row, axis], rel=1e-6)
 
 
 # --- as a hyperparameter -------------------------------------------------------------------------

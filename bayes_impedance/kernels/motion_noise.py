@@ -48,8 +48,8 @@ class MotionNoiseKernel(BatchedKernel):
         columns: seven columns of the input: label of the trial, first native sample of the window that serves the
             sample, its place in it, length of the window (0: no noise), order of the polynomial, native step [s], and
             how many of position, velocity and acceleration come from the recorded positions.
-        processes: priors of k, d and m, those of the `ImpedanceKernel`, whose parts they stay: their hyperparameters are
-            not listed here.
+        processes: priors of k, d and m, those of the `ImpedanceKernel`, whose parts they stay: their hyperparameters
+            are not listed here.
         weights: the filter.
         sd_prior: prior of σ_x.
 
