@@ -25,6 +25,9 @@ from bayes_impedance.kernels.warped import ImpedanceProcess
 #: of a filter of so many samples, of that polynomial order, at that step [s].
 Weights = Callable[[int, int, float], NDArray[np.float64]]
 
+#: Pairs are taken this many at a time, which bounds memory where windows are long.
+CHUNK = 4096
+
 
 class _Smoothing(NamedTuple):
     """The columns that the kernel reads, `(..., n)` each."""
@@ -142,7 +145,8 @@ class MotionNoiseKernel(BatchedKernel):
             which[chosen] = index + sum(len(table) for table in tables)
             weights = self.weights(int(length), int(order), step)[: int(from_positions)]
             table = lag.new_zeros(len(codes), 3, 3)
-            table[:, : len(weights), : len(weights)] = torch.from_numpy(_shared(weights, codes.numpy()))
+            parts = [torch.from_numpy(_shared(weights, part.numpy())) for part in codes.split(CHUNK)]
+            table[:, : len(weights), : len(weights)] = torch.cat(parts)
             tables.append(table)
         return torch.cat(tables)[which]
 
