@@ -238,13 +238,15 @@ def test_one_point_equals_the_dense_posterior(device):
         }
     )
     model = ImpedanceModel(config).fit(recording(axes=("x", "y")))
-    log = model.fitted.log
+    new = model.prepare(recording(seed=1, axes=("x", "y")))
+    log = replace(model.fitted.log, trials=(*model.fitted.log.trials, replace(new.trials[0], name="new")))
+    # Of the last trial nothing is known, and its noise is its own.
     expected = model.posterior(log, given="training")["force"]
-    mean = TrajectoryMean.from_training(config.model.desired_trajectory, log)
+    mean = TrajectoryMean.from_training(config.model.desired_trajectory, model.fitted.log)
     inputs = FeatureMap(config, log.axes)(log, mean).inputs[:, 0].numpy()
     for axis, name in enumerate(log.axes):
         predictor = model.point_predictor(name, "0")
-        for row in (0, 7, 19):
+        for row in (0, 7, 19, 39, 40, 50):
             value, variance = predictor.predict(inputs[axis, row])
             assert value == pytest.approx(expected.mean[row, axis], rel=1e-8, abs=1e-8)
             assert np.sqrt(variance) == pytest.approx(expected.sd[row, axis], rel=1e-6)

@@ -10,7 +10,7 @@ S_ij(s,t) = Cov[η̂⁽ⁱ⁾(s), η̂⁽ʲ⁾(t)] = σ_x² Σ_n c⁽ⁱ⁾_s(n)
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -142,11 +142,15 @@ class MotionNoiseKernel(BatchedKernel):
             # Few differ: within a trial the place is the middle, and the lags are those of one window.
             code = ((one.place * length + two.place) * 2 + 1) * length + lag
             codes, index = code[chosen].long().unique(return_inverse=True)
+            places, later = np.divmod(codes.numpy(), 2 * int(length))
+            place1, place2 = np.divmod(places, int(length))
             which[chosen] = index + sum(len(table) for table in tables)
             weights = self.weights(int(length), int(order), step)[: int(from_positions)]
             table = lag.new_zeros(len(codes), 3, 3)
-            parts = [torch.from_numpy(_shared(weights, part.numpy())) for part in codes.split(CHUNK)]
-            table[:, : len(weights), : len(weights)] = torch.cat(parts)
+            for start in range(0, len(codes), CHUNK):
+                part = slice(start, start + CHUNK)
+                noise = shared_noise(weights, place1[part], place2[part], later[part] - int(length))
+                table[part, : len(weights), : len(weights)] = torch.from_numpy(noise)
             tables.append(table)
         return torch.cat(tables)[which]
 
@@ -166,16 +170,18 @@ def _near(one: _Smoothing, two: _Smoothing) -> Tensor:
     return (one.trial == two.trial) & ((two.first - one.first).abs() < torch.minimum(one.length, two.length))
 
 
-def _shared(weights: NDArray[np.float64], codes: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Σ_n c⁽ⁱ⁾(n) c⁽ʲ⁾(n) over the samples that two windows share, `(pairs, orders, orders)`.
+def shared_noise(
+    weights: NDArray[np.float64], place1: Any, place2: NDArray[np.int64], lag: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Σ_n c⁽ⁱ⁾(n) c⁽ʲ⁾(n) over the samples that two windows share, `(pairs, orders, orders)` [s^−(i + j)].
 
-    A code is ((place · length + other place) · 2 + 1) · length + lag, by which the second window begins later.
+    `weights` `(orders, length, length)` of a window at each of its places; `place1` (or one for all) and `place2` of the
+    two samples, `(pairs,)`; `lag` `(pairs,)`: samples by which the second window begins later.
     """
     length = weights.shape[-1]
-    places, lag = np.divmod(codes, 2 * length)
-    place1, place2 = np.divmod(places, length)
-    in_second = np.arange(length) - (lag - length)[:, None]
+    in_second = np.arange(length) - lag[:, None]
     shared = (in_second >= 0) & (in_second < length)
-    one = weights[:, place1]
+    one = weights[:, np.broadcast_to(place1, lag.shape)]
     two = weights[:, place2[:, None], np.where(shared, in_second, 0)] * shared
-    return np.einsum("ipn,jpn->pij", one, two, optimize=True)
+    product: NDArray[np.float64] = one.transpose(1, 0, 2) @ two.transpose(1, 2, 0)
+    return product
