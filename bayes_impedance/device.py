@@ -82,7 +82,12 @@ def _by_law(trial: PreparedTrial, mass: Array, damping: Array) -> PreparedTrial:
             "acceleration, found none; set device.acceleration=measured"
         )
     acceleration = (_drive(trial) - damping * trial.velocity) / mass
-    return replace(trial, acceleration=acceleration, jerk=np.gradient(acceleration, trial.time, axis=0))
+    jerk = np.gradient(acceleration, trial.time, axis=0)
+    smoothing = trial.smoothing
+    if smoothing is not None:
+        # Position and velocity at most are left to come from the recorded positions.
+        smoothing = np.column_stack([smoothing[:, :-1], np.minimum(smoothing[:, -1], 2.0)])
+    return replace(trial, acceleration=acceleration, jerk=jerk, smoothing=smoothing)
 
 
 def _drive(trial: PreparedTrial) -> Array:

@@ -74,6 +74,7 @@ class FeatureMap:
             error=take("error", 0 if model.desired_trajectory.mean == "equilibrium" else 3),
             trajectory=None if self.trajectory_shared else take("trajectory", 1)[0],
             residual=None if self.residual_shared else take("residual", 1)[0],
+            smoothing=take("smoothing", 7 if _carries_motion_noise(model) else 0),
         )
         for component in self.xi:
             take(f"xi.{component}", self._size(component))
@@ -107,6 +108,9 @@ class FeatureMap:
 
         `trial_labels` maps `trial_key` to a label, so that two logs can be put into one covariance; `observed` leaves
         out samples without known force, which cannot be conditioned on.
+
+        Raises:
+            ConfigurationError: noise of the positions is to be carried, and the motion did not pass the smoother.
         """
         labels = trial_labels or label_trials(log)
         blocks = [self._trial(trial, mean, labels[trial_key(trial)]) for trial in log.trials]
@@ -162,6 +166,8 @@ class FeatureMap:
         for column in (self.layout.trajectory, self.layout.residual):
             if column is not None:
                 values[..., column] = label
+        if self.layout.smoothing:
+            values[..., list(self.layout.smoothing)] = np.column_stack([np.full(n, label), _smoothing(trial)])
         return values, np.moveaxis(desired, (0, 1, 2), (2, 1, 0))
 
     def _values(self, trial: PreparedTrial, component: str) -> tuple[Array, Array, Array]:
@@ -178,6 +184,21 @@ class FeatureMap:
 
     def _size(self, component: str) -> int:
         return 1 if component in ("time", "phase") else len(self.axes)
+
+
+def _carries_motion_noise(model: ModelConfig) -> bool:
+    # Around the hand itself its noise cancels (a naive GP has this mean, too).
+    return model.position_noise_sd is not None and model.desired_trajectory.mean != "equilibrium"
+
+
+def _smoothing(trial: PreparedTrial) -> Array:
+    if trial.smoothing is None:
+        raise ConfigurationError(
+            f"{trial.source}, trial {trial.name}: expected motion from the smoother with model.position_noise_sd, "
+            "which says what the smoother leaves of the noise, found motion that did not pass it; set "
+            "preprocessing.smoother, or model.position_noise_sd=null"
+        )
+    return trial.smoothing
 
 
 def theta_components(model: ModelConfig) -> tuple[Component, ...]:

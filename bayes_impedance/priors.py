@@ -24,8 +24,10 @@ from bayes_impedance.config.sections import Component
 from bayes_impedance.errors import ConfigurationError
 from bayes_impedance.features import UNITS, FeatureMap, baseline_components, theta_components
 from bayes_impedance.kernels.impedance import ImpedanceKernel, InputLayout, InteractionKernel
+from bayes_impedance.kernels.motion_noise import MotionNoiseKernel
 from bayes_impedance.kernels.stationary import StationaryKernel, log_positive
 from bayes_impedance.kernels.warped import ImpedanceProcess, Law
+from bayes_impedance.preprocessing.savitzky_golay import motion_weights
 
 #: Constrained values stay inside the open interval that their constraint maps to.
 INSIDE = 1e-3
@@ -193,7 +195,14 @@ def build_force_model(config: Config, features: FeatureMap) -> ForceModel:
             )
             residual = AdditiveKernel(residual, offset)
     layout: InputLayout = features.layout
-    kernel = InteractionKernel(ImpedanceKernel(layout, trajectory, stiffness, damping, mass), residual)
+    impedance = ImpedanceKernel(layout, trajectory, stiffness, damping, mass)
+    motion_noise = None
+    if layout.smoothing:
+        assert model.position_noise_sd is not None
+        motion_noise = MotionNoiseKernel(
+            layout.smoothing, impedance.processes, motion_weights, _prior(model.position_noise_sd), batch
+        )
+    kernel = InteractionKernel(impedance, residual, motion_noise=motion_noise)
 
     def entries(force_model: ForceModel) -> list[Entry]:
         impedance = force_model.kernel.impedance
@@ -220,6 +229,10 @@ def build_force_model(config: Config, features: FeatureMap) -> ForceModel:
                 listed.append(_entry("residual.offset_sd", "N", offset, "sd", model.residual.offset_sd))
             listed += _residual_entries(part, config, model.residual.input, features)
         listed.append(_noise_entry(force_model, config))
+        if force_model.kernel.motion_noise is not None:
+            assert model.position_noise_sd is not None
+            part = force_model.kernel.motion_noise
+            listed.append(_entry("position_noise_sd", "m", part, "sd", model.position_noise_sd))
         return listed
 
     return ForceModel(kernel, _likelihood(config, batch), entries)

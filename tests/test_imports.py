@@ -108,6 +108,14 @@ INSPECTION = (
 )
 
 
+KERNELS = (
+    "kernels.stationary",
+    "kernels.derivative",
+    "kernels.warped",
+    "kernels.motion_noise",
+    "kernels.impedance",
+    "kernels",
+)
 COMMANDS = (
     "commands.inspection_tables",
     "commands.inspect",
@@ -127,7 +135,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             RECORDING,
             {*READERS, *PREPROCESSING, "writer"},
             {"trajectory_mean", "device", *INSPECTION},
-            {"kernels", "kernels.stationary", "kernels.derivative", "kernels.warped", "kernels.impedance"},
+            KERNELS,
             {"features"},
             {"priors"},
             {"engines", "engines.dense", "engines.closed_loop", "engines.pointwise"},
@@ -160,7 +168,7 @@ FAMILIES = (
     RECORDING,
     PREPROCESSING,
     READERS,
-    ("kernels.stationary", "kernels.derivative", "kernels.warped", "kernels.impedance", "kernels"),
+    KERNELS,
     ("engines.dense", "engines.closed_loop", "engines.pointwise", "engines"),
     BASELINES,
     SIMULATION,

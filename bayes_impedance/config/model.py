@@ -126,7 +126,11 @@ class ResidualPrior(Section):
 
 
 class ModelConfig(Section):
-    """Priors of every latent of u = Σ_j w_j e⁽ʲ⁾ + ũ + ε."""
+    """Priors of every latent of u = Σ_j w_j e⁽ʲ⁾ + ũ + ε.
+
+    `position_noise_sd` [m]: white noise of the recorded positions, whose share that the smoother leaves in position,
+    velocity and acceleration is part of the covariance of the force; None leaves it out.
+    """
 
     trajectory_input: TrajectoryInput = "time"
     drop_acceleration: bool = False
@@ -136,9 +140,15 @@ class ModelConfig(Section):
     mass: MassPrior = MassPrior()
     residual: ResidualPrior | None = ResidualPrior()
     noise_sd: Scale = learned(0.2)
+    position_noise_sd: Scale | None = None
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        if self.position_noise_sd is not None and self.desired_trajectory.mean == "equilibrium":
+            raise ValueError(
+                "position_noise_sd: with desired_trajectory.mean: equilibrium the position cancels from x_d − x, and "
+                "its noise with it; set position_noise_sd to null, or take another mean"
+            )
         if self.drop_acceleration and self.trajectory_input != "position_velocity":
             raise ValueError(
                 "drop_acceleration: expected trajectory_input: position_velocity with it, got "

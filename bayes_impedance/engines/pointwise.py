@@ -8,7 +8,7 @@ are one small matrix times a matrix kept from training.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from bayes_impedance.engines.closed_loop import LoopEvidence
 from bayes_impedance.engines.dense import Factor, Observations
 from bayes_impedance.kernels.derivative import Forms, Table, combine
 from bayes_impedance.kernels.impedance import InteractionKernel, Latent, force_covariance
+from bayes_impedance.kernels.motion_noise import MotionNoiseKernel, shared_noise
 from bayes_impedance.kernels.stationary import StationaryKernel
 from bayes_impedance.kernels.warped import ImpedanceProcess
 
@@ -71,6 +72,8 @@ class PointPredictor:
         self._residual_variance = sum(part.variance for part in residual_parts)
         self._labels = None if self._layout.residual is None else inputs[:, self._layout.residual]
         self._errors = [inputs[:, c] for c in self._layout.error] or None
+        noise = kernel.motion_noise
+        self._motion_noise = None if noise is None else _MotionNoise(noise, self._expectations, inputs)
         self._loop: LoopEvidence | None = None
         if loop is not None:
             self._loop = LoopEvidence(impedance, factor, observations, loop)
@@ -93,6 +96,10 @@ class PointPredictor:
             )
         prior = self._residual_variance
         prior += force_covariance(weights, weights, self._variances, own_table, own, errors, errors)
+        if self._motion_noise is not None:
+            near, noise = self._motion_noise.row(x, covariance)
+            cross[near] += noise
+            prior += self._motion_noise.variance(x, self._variances)
         # On one thread, unlike a product with the inverse: waking another can cost milliseconds.
         white = dtrsv(self._cholesky, cross, lower=1)
         mean = cross @ self._alpha
@@ -231,6 +238,48 @@ class _Rows:
             for k, s in zip(members, distances, strict=True):
                 rows[k] = self.parts[k].from_distance(s)
         return rows
+
+
+class _MotionNoise:
+    """What noise of the recorded motion adds to the covariance, between one sample and the training samples."""
+
+    def __init__(self, kernel: MotionNoiseKernel, expectations: Sequence[float], inputs: Array) -> None:
+        self.columns = list(kernel.columns)
+        self.weights = kernel.weights
+        self.variance_of_noise = float(kernel.sd.detach() ** 2)
+        self.products = np.outer(expectations, expectations)
+        self.trial, first, place = inputs[:, self.columns[:3]].T
+        self.first, self.place = first.astype(np.int64), place.astype(np.int64)
+
+    def row(self, x: Array, covariance: Mapping[tuple[int, int], Any]) -> tuple[NDArray[np.int64], Array]:
+        """Training samples whose windows share samples with that of `x`, and N at them [N²]."""
+        trial, first, place, weights = self._window(x)
+        lag = self.first - first
+        near = np.flatnonzero((self.trial == trial) & (np.abs(lag) < weights.shape[-1]))
+        if not near.size:
+            return near, np.zeros(0)
+        moments = {pair: c[near] if np.ndim(c) else c for pair, c in covariance.items()}
+        return near, self._sum(shared_noise(weights, place, self.place[near], lag[near]), moments)
+
+    def variance(self, x: Array, variances: Mapping[tuple[int, int], float]) -> float:
+        """N of the sample itself [N²]."""
+        _, _, place, weights = self._window(x)
+        own = weights[:, place] @ weights[:, place].T
+        return float(self._sum(own[None], variances)[0])
+
+    def _window(self, x: Array) -> tuple[float, int, int, Array]:
+        trial, first, place, length, order, step, from_positions = x[self.columns].tolist()
+        weights = self.weights(int(length), int(order), step)
+        return trial, int(first), int(place), weights[: int(from_positions)]
+
+    def _sum(self, noise: Array, covariance: Mapping[tuple[int, int], Any]) -> Array:
+        """Σ_ij (E_i E_j' + C_ij) S_ij over the orders that carry noise."""
+        orders = noise.shape[-1]
+        total = (noise * self.products[:orders, :orders]).sum((1, 2))
+        for (i, j), c in covariance.items():
+            if max(i, j) < orders:
+                total = total + c * noise[:, i, j]
+        return self.variance_of_noise * total
 
 
 class _Process:

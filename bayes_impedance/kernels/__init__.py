@@ -6,5 +6,6 @@ from bayes_impedance.kernels.impedance import InteractionKernel as InteractionKe
 from bayes_impedance.kernels.impedance import InteractionMean as InteractionMean
 from bayes_impedance.kernels.impedance import Latent as Latent
 from bayes_impedance.kernels.impedance import PDKernel as PDKernel
+from bayes_impedance.kernels.motion_noise import MotionNoiseKernel as MotionNoiseKernel
 from bayes_impedance.kernels.stationary import StationaryKernel as StationaryKernel
 from bayes_impedance.kernels.warped import ImpedanceProcess as ImpedanceProcess

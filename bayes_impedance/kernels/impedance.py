@@ -19,6 +19,7 @@ from gpytorch.means import Mean
 from torch import Tensor
 
 from bayes_impedance.kernels.derivative import Path, Table, derivative_table, multiply_add
+from bayes_impedance.kernels.motion_noise import MotionNoiseKernel
 from bayes_impedance.kernels.stationary import BatchedKernel, StationaryKernel
 from bayes_impedance.kernels.warped import ImpedanceProcess, evaluate
 
@@ -53,7 +54,8 @@ class InputLayout:
     `theta`, `theta_velocity` [1/s], `theta_acceleration` [1/s²]: θ and its time derivatives, p columns
     each; an empty acceleration means zero. `error`: ē_0, ē_1, ē_2 [m, m/s, m/s²]; empty where the prior
     mean of x_d is the hand itself. `trajectory`, `residual`: a column of labels; samples with different
-    labels have independent x_d, or ũ. None means one for all.
+    labels have independent x_d, or ũ. None means one for all. `smoothing`: see `MotionNoiseKernel`; empty where the
+    noise of the recorded motion is left out.
     """
 
     theta: tuple[int, ...]
@@ -62,6 +64,7 @@ class InputLayout:
     error: tuple[int, ...] = ()
     trajectory: int | None = None
     residual: int | None = None
+    smoothing: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         p = len(self.theta)
@@ -284,6 +287,7 @@ class InteractionKernel(BatchedKernel):
     Args:
         impedance: covariance of the impedance force.
         residual: any gpytorch kernel for ũ; None for no residual.
+        motion_noise: covariance that noise of the recorded motion adds to the force; None where it is left out.
 
     Example:
         >>> layout = InputLayout(theta=(0,), theta_velocity=(1,))  # a column of time, and one of its rate, 1
@@ -301,15 +305,21 @@ class InteractionKernel(BatchedKernel):
         impedance: ImpedanceKernel,
         residual: Kernel | None = None,
         active_dims: tuple[int, ...] | None = None,
+        motion_noise: MotionNoiseKernel | None = None,
     ) -> None:
         super().__init__(active_dims=active_dims)
-        _check_takes_every_column(impedance, "give active_dims to the InteractionKernel")
+        for part in (impedance, motion_noise):
+            if part is not None:
+                _check_takes_every_column(part, "give active_dims to the InteractionKernel")
         self.impedance = impedance
         self.residual = residual
+        self.motion_noise = motion_noise
 
     def forward(self, x1: Tensor, x2: Tensor, diag: bool = False, **params: object) -> Tensor:
         """Cov[u, u'], `(..., n1, n2)`, or `(..., n)` with `diag` [N²]."""
         total = self.impedance.forward(x1, x2, diag=diag)
+        if self.motion_noise is not None:
+            total = total + self.motion_noise.forward(x1, x2, diag=diag)
         return total if self.residual is None else total + self.residual_covariance(x1, x2, diag)
 
     def residual_covariance(self, x1: Tensor, x2: Tensor, diag: bool = False) -> Tensor:

@@ -79,13 +79,23 @@ def _smoothed(trial: Trial, smooth: SavitzkyGolay) -> PreparedTrial:
         velocity, acceleration, jerk = (smooth(trial.velocity, order) for order in (0, 1, 2))
     if trial.acceleration is not None:
         acceleration, jerk = smooth(trial.acceleration), smooth(trial.acceleration, 1)
-    return _assembled(
+    prepared = _assembled(
         trial,
         (smooth(trial.position), velocity, acceleration, jerk),
         value=smooth,
         orders=lambda values: (smooth(values), smooth(values, 1), smooth(values, 2)),
         phase_orders=lambda phase, part: _smooth_phase(trial, phase, part, smooth),
     )
+    return replace(prepared, smoothing=_smoothing(trial, smooth))
+
+
+def _smoothing(trial: Trial, smooth: SavitzkyGolay) -> Array:
+    """What `PreparedTrial.smoothing` says, `(n, 6)`."""
+    first, place_in_window = smooth.windows(trial.n_samples)
+    from_positions = 1 + (trial.velocity is None) * (1 + (trial.acceleration is None))
+    constants = (smooth.length, smooth.order, smooth.step, from_positions)
+    columns = [first, place_in_window, *(np.full(trial.n_samples, value) for value in constants)]
+    return np.stack(columns, axis=1).astype(np.float64)
 
 
 def _assembled(

@@ -20,7 +20,10 @@ class PreparedTrial:
     `time (n,)` [s]; `(n, a)`: `position`, `reference` [m], `velocity`, `reference_velocity` [m/s],
     `acceleration`, `reference_acceleration` [m/s²], `jerk` [m/s³], `force`, `perturbation` [N]; `(n,)`:
     `repetition`, `phase` [1], `phase_velocity` [1/s], `phase_acceleration` [1/s²]; `truth` `(n,)` [SI] each.
-    Force is NaN at samples where it is not known: nothing is conditioned on there.
+    Force is NaN at samples where it is not known: nothing is conditioned on there. `smoothing` `(n, 6)` is the filter
+    that the motion went through, None where there was none: at each sample the first native sample of its window and
+    its place in it, length of the window [samples], order of the polynomial, native step [s], and how many of position,
+    velocity and acceleration come from the recorded positions.
     """
 
     name: str
@@ -40,6 +43,7 @@ class PreparedTrial:
     reference_velocity: Array | None = None
     reference_acceleration: Array | None = None
     perturbation: Array | None = None
+    smoothing: Array | None = None
     truth: Mapping[str, Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial.legendre import legder, legvander
@@ -12,7 +13,7 @@ from scipy.ndimage import correlate1d
 
 from bayes_impedance.config import Smoother
 from bayes_impedance.errors import LogError, LogWarning
-from bayes_impedance.log import Array, Trial
+from bayes_impedance.log import Array, Integers, Trial
 from bayes_impedance.preprocessing.grid import place
 
 #: Samples of half a window; a number that does not overflow, and that no log has.
@@ -44,6 +45,18 @@ class SavitzkyGolay:
         weights: Array = evaluate[self.length // 2] @ fit
         return weights
 
+    def weights(self, derivative: int = 0) -> Array:
+        """Weights of a window's samples in the value at each of its places, `(length, length)` [1/s^derivative]."""
+        fit, evaluate = self._fit(derivative)
+        weights: Array = evaluate @ fit
+        return weights
+
+    def windows(self, n: int) -> tuple[Integers, Integers]:
+        """First sample of the window that serves each of `n` samples, and the sample's place in it, `(n,)` each."""
+        samples = np.arange(n)
+        first = np.clip(samples - self.length // 2, 0, n - self.length)
+        return first, samples - first
+
     def _fit(self, derivative: int) -> tuple[Array, Array]:
         """Samples of a window → coefficients of the polynomial, and these → a derivative at each sample."""
         half = self.length // 2
@@ -53,6 +66,18 @@ class SavitzkyGolay:
         fit = np.asarray(np.linalg.pinv(legvander(offsets, self.order)), dtype=np.float64)
         evaluate = legvander(offsets, self.order - derivative) @ legder(np.eye(self.order + 1), derivative)
         return fit, evaluate / (half * self.step) ** derivative
+
+
+@lru_cache(maxsize=64)
+def motion_weights(length: int, order: int, step: float) -> Array:
+    """Weights of a window in position, velocity and acceleration at each of its places, `(3, length, length)` [s^−r].
+
+    The filter is that of `SavitzkyGolay(length, order, step)`.
+    """
+    smooth = SavitzkyGolay(length, order, step)
+    weights = np.stack([smooth.weights(derivative) for derivative in range(3)])
+    weights.setflags(write=False)
+    return weights
 
 
 def choose_filter(trial: Trial, smoother: Smoother, step: float) -> SavitzkyGolay:
