@@ -59,16 +59,20 @@ def _prepare(trial: Trial, config: PreprocessingConfig) -> PreparedTrial:
     step = float(np.median(steps))
     if config.phase.source != "column":
         trial = replace(trial, phase=None)
+    smooth = None
     if config.smoother is None:
         prepared = _as_logged(trial)
     else:
         # Relative slack, here and below: differences of time stamps carry rounding errors.
         if np.abs(steps - step).max() > UNEVEN * step * (1 + 1e-9):
             trial = on_even_grid(trial, step)
-        prepared = _smoothed(trial, choose_filter(trial, config.smoother, step))
+        smooth = choose_filter(trial, config.smoother, step)
+        prepared = _smoothed(trial, smooth)
     if config.phase.source != "column":
         prepared = along_path(prepared, config.phase.rest_speed)
-    return _thinned(prepared, step, config.rate)
+    every = _stride(prepared, step, config.rate)
+    prepared = _thinned(prepared, every)
+    return prepared if smooth is None else replace(prepared, smoothing=_smoothing(trial, smooth, every))
 
 
 def _smoothed(trial: Trial, smooth: SavitzkyGolay) -> PreparedTrial:
@@ -79,22 +83,21 @@ def _smoothed(trial: Trial, smooth: SavitzkyGolay) -> PreparedTrial:
         velocity, acceleration, jerk = (smooth(trial.velocity, order) for order in (0, 1, 2))
     if trial.acceleration is not None:
         acceleration, jerk = smooth(trial.acceleration), smooth(trial.acceleration, 1)
-    prepared = _assembled(
+    return _assembled(
         trial,
         (smooth(trial.position), velocity, acceleration, jerk),
         value=smooth,
         orders=lambda values: (smooth(values), smooth(values, 1), smooth(values, 2)),
         phase_orders=lambda phase, part: _smooth_phase(trial, phase, part, smooth),
     )
-    return replace(prepared, smoothing=_smoothing(trial, smooth))
 
 
-def _smoothing(trial: Trial, smooth: SavitzkyGolay) -> Array:
-    """What `PreparedTrial.smoothing` says, `(n, 6)`."""
-    first, place_in_window = smooth.windows(trial.n_samples)
+def _smoothing(trial: Trial, smooth: SavitzkyGolay, every: int) -> Array:
+    """What `PreparedTrial.smoothing` says of the samples that are kept, `(n, 6)`."""
+    first, place_in_window = (column[::every] for column in smooth.windows(trial.n_samples))
     from_positions = 1 + (trial.velocity is None) * (1 + (trial.acceleration is None))
     constants = (smooth.length, smooth.order, smooth.step, from_positions)
-    columns = [first, place_in_window, *(np.full(trial.n_samples, value) for value in constants)]
+    columns = [first, place_in_window, *(np.full(len(first), value) for value in constants)]
     return np.stack(columns, axis=1).astype(np.float64)
 
 
@@ -194,17 +197,23 @@ def _gradients(values: Array, time: Array) -> Orders:
 # --- rate ----------------------------------------------------------------------------------------
 
 
-def _thinned(trial: PreparedTrial, step: float, rate: float | None) -> PreparedTrial:
-    """Every s-th sample, the first included, with s = the native over the wanted rate, rounded."""
+def _stride(trial: PreparedTrial, step: float, rate: float | None) -> int:
+    """Native over wanted rate, rounded."""
     if rate is None:
-        return trial
+        return 1
     if rate * step > 1 + UNEVEN:
         raise LogError(
             f"{place(trial)}: expected preprocessing.rate of at most the native rate, {1 / step:.4g} Hz, found "
             f"{rate:g} Hz; lower it or leave it out"
         )
     # However low the rate, the first sample stays.
-    every = max(1, round(1 / max(step * rate, 1 / trial.n_samples)))
+    return max(1, round(1 / max(step * rate, 1 / trial.n_samples)))
+
+
+def _thinned(trial: PreparedTrial, every: int) -> PreparedTrial:
+    """Each sample that is a multiple of `every` away from the first."""
+    if every == 1:
+        return trial
     changes: dict[str, Any] = {
         name: value[::every] for name in ARRAYS if (value := getattr(trial, name)) is not None
     }
