@@ -175,8 +175,8 @@ def shared_noise(
 ) -> NDArray[np.float64]:
     """Σ_n c⁽ⁱ⁾(n) c⁽ʲ⁾(n) over the samples that two windows share, `(pairs, orders, orders)` [s^−(i + j)].
 
-    `weights` `(orders, length, length)` of a window at each of its places; `place1` (or one for all) and `place2` of the
-    two samples, `(pairs,)`; `lag` `(pairs,)`: samples by which the second window begins later.
+    `weights` `(orders, length, length)` of a window at each of its places. `place1` (or one for all) and `place2`
+    `(pairs,)` of the two samples; `lag` `(pairs,)`: samples by which the second window begins later.
     """
     length = weights.shape[-1]
     in_second = np.arange(length) - lag[:, None]
