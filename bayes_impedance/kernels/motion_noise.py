@@ -57,6 +57,7 @@ class MotionNoiseKernel(BatchedKernel):
         sd_prior: prior of σ_x.
 
     Example:
+        >>> from bayes_impedance.kernels import StationaryKernel
         >>> average = lambda length, order, step: np.stack([np.full((length, length), 1.0 / length)] * 3)
         >>> k, d, m = (ImpedanceProcess(StationaryKernel(num_dims=0), "gaussian").double() for _ in range(3))
         >>> kernel = MotionNoiseKernel(tuple(range(7)), (k, d, m), average).double()
