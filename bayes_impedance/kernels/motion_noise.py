@@ -57,6 +57,7 @@ class MotionNoiseKernel(BatchedKernel):
         sd_prior: prior of σ_x.
 
     Example:
+        >>> from bayes_impedance.kernels import StationaryKernel
         >>> average = lambda length, order, step: np.stack([np.full((length, length), 1.0 / length)] * 3)
         >>> k, d, m = (ImpedanceProcess(StationaryKernel(num_dims=0), "gaussian").double() for _ in range(3))
         >>> kernel = MotionNoiseKernel(tuple(range(7)), (k, d, m), average).double()
@@ -175,8 +176,8 @@ def shared_noise(
 ) -> NDArray[np.float64]:
     """Σ_n c⁽ⁱ⁾(n) c⁽ʲ⁾(n) over the samples that two windows share, `(pairs, orders, orders)` [s^−(i + j)].
 
-    `weights` `(orders, length, length)` of a window at each of its places; `place1` (or one for all) and `place2` of the
-    two samples, `(pairs,)`; `lag` `(pairs,)`: samples by which the second window begins later.
+    `weights` `(orders, length, length)` of a window at each of its places. `place1` (or one for all) and `place2`
+    `(pairs,)` of the two samples; `lag` `(pairs,)`: samples by which the second window begins later.
     """
     length = weights.shape[-1]
     in_second = np.arange(length) - lag[:, None]
