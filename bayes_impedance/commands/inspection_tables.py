@@ -168,7 +168,12 @@ def _smoother_table(inspection: Inspection) -> Table:
             f"{effect.window:.3g}", ", ".join(f"{frequency:.3g}" for frequency in effect.bandwidth), f"{1e6 * x:.2g}",
             f"{1e3 * v:.2g}", f"{a:.2g}", f"{effect.force_noise(*medians).max():.2g}", removed, style=style,
         )  # fmt: skip
-    table.caption = "bold: as configured; of the noisiest axis; force: k x + d v + m a at the priors' medians"
+    noise = min(inspection.smoothing, key=lambda effect: abs(effect.window - smoother.window)).recorded_noise
+    listed = ", ".join(f"{value:.2g}" for value in 1e6 * noise)
+    table.caption = (
+        f"noise of the recorded positions: {listed} µm by axis (model.position_noise_sd carries it). Bold: as "
+        "configured; of the noisiest axis; force: k x + d v + m a at the priors' medians"
+    )
     return table
 
 

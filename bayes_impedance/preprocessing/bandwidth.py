@@ -68,13 +68,15 @@ def sample_noise(values: Array, smooth: SavitzkyGolay) -> Array:
 class SmootherEffect:
     """What one window does.
 
-    `window` [s]; `bandwidth` `(3,)` [Hz] of position, velocity and acceleration; `covariance` `(a, 3, 3)`: of position
-    [m], velocity [m/s] and acceleration [m/s²], from the noise of the positions; `removed` `(a,)` [1]: share of the
-    variance of force that the window takes away, None without force.
+    `window` [s]; `bandwidth` `(3,)` [Hz] of position, velocity and acceleration; `recorded_noise` `(a,)` [m]: SD of the
+    noise of the recorded positions; `covariance` `(a, 3, 3)`: what it leaves in position [m], velocity [m/s] and
+    acceleration [m/s²]; `removed` `(a,)` [1]: share of the variance of force that the window takes away, None without
+    force.
     """
 
     window: float
     bandwidth: Array
+    recorded_noise: Array
     covariance: Array
     removed: Array | None
 
@@ -100,7 +102,7 @@ def smoother_effect(trial: Trial, smoother: Smoother) -> SmootherEffect:
     step = float(np.median(np.diff(trial.time)))
     trial = on_even_grid(trial, step)
     smooth = choose_filter(trial, smoother, step)
-    variance = sample_noise(trial.position[:ENOUGH], smooth) ** 2
+    noise = sample_noise(trial.position[:ENOUGH], smooth)
     removed = None
     if trial.force is not None:
         force = trial.force[:ENOUGH]
@@ -109,6 +111,7 @@ def smoother_effect(trial: Trial, smoother: Smoother) -> SmootherEffect:
     return SmootherEffect(
         smooth.length * step,
         np.array([bandwidth(smooth, order) for order in ORDERS]),
-        variance[:, None, None] * noise_covariance(smooth),
+        noise,
+        noise[:, None, None] ** 2 * noise_covariance(smooth),
         removed,
     )

@@ -70,6 +70,7 @@ def test_force_from_noise_is_that_of_the_filtered_positions():
     weights = (200.0, 15.0, 1.5)
     force = sum(weight * smooth(still, order) for order, weight in enumerate(weights))
     assert effect.window == pytest.approx(0.105)
+    np.testing.assert_allclose(effect.recorded_noise, 1e-4, rtol=0.05)
     np.testing.assert_allclose(effect.force_noise(*weights), force.std(), rtol=0.05)
     np.testing.assert_allclose(effect.noise[0], [smooth(still, order).std() for order in range(3)], rtol=0.05)
     # 6.4 Hz lies under the bandwidth, and hardly anything of it is removed.
