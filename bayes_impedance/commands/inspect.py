@@ -55,17 +55,13 @@ def inspect_command(
     for path in (write_config, figure):
         if path is not None:
             check_writable(path)
-    if config is None:
-        first = draft(logs, overrides or [])
-        inspection, text = first.inspection, first.text
-    else:
-        inspection = inspect_recordings(logs, load_config(config, overrides or []))
-        text = None
+    known = None if config is None else inspect_recordings(logs, load_config(config, overrides or []))
+    first = draft(logs, overrides or [], known)
+    inspection = first.inspection
     print_inspection(console, inspection)
     if write_config is not None:
-        text = draft(logs, overrides or [], inspection).text if text is None else text
         with whole_file(write_config) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+            temporary.write_text(first.text, encoding="utf-8")
         console.print(
             f"wrote {write_config}; check it, then: --config {write_config}", highlight=False, soft_wrap=True
         )

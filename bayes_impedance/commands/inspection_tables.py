@@ -18,8 +18,6 @@ from bayes_impedance.recording.device_law import DeviceLaw
 
 #: Trials and topics beyond this many are counted and not listed.
 LONGEST_TABLE = 12
-#: Of the variance of force that a robot's law explains where it has one.
-LEAST_SHARE = 0.5
 
 
 def print_inspection(console: Console, inspection: Inspection) -> None:
@@ -159,17 +157,16 @@ def _smoother_table(inspection: Inspection) -> Table:
     )  # fmt: skip
     smoother = inspection.config.preprocessing.smoother
     assert smoother is not None
-    chosen = min((abs(effect.window - smoother.window) for effect in inspection.smoothing), default=0.0)
+    configured = min(inspection.smoothing, key=lambda effect: abs(effect.window - smoother.window))
     for effect in inspection.smoothing:
         x, v, a = effect.noise.max(axis=0)
         removed = "" if effect.removed is None else f"{effect.removed.max():.1%}"
-        style = "bold" if abs(effect.window - smoother.window) == chosen else None
+        style = "bold" if effect is configured else None
         table.add_row(
             f"{effect.window:.3g}", ", ".join(f"{frequency:.3g}" for frequency in effect.bandwidth), f"{1e6 * x:.2g}",
             f"{1e3 * v:.2g}", f"{a:.2g}", f"{effect.force_noise(*medians).max():.2g}", removed, style=style,
         )  # fmt: skip
-    noise = min(inspection.smoothing, key=lambda effect: abs(effect.window - smoother.window)).recorded_noise
-    listed = ", ".join(f"{value:.2g}" for value in 1e6 * noise)
+    listed = ", ".join(f"{value:.2g}" for value in 1e6 * configured.recorded_noise)
     table.caption = (
         f"noise of the recorded positions: {listed} µm by axis (model.position_noise_sd carries it). Bold: as "
         "configured; of the noisiest axis; force: k x + d v + m a at the priors' medians"
@@ -179,7 +176,7 @@ def _smoother_table(inspection: Inspection) -> Table:
 
 def _print_law(console: Console, law: DeviceLaw, axes: Sequence[str]) -> None:
     """Virtual mass and damping of the robot, an axis a row; a sentence where it has none."""
-    if law.pooled < LEAST_SHARE:
+    if not law.holds:
         console.print(
             f"The robot does not answer force by a mass and a damping: R² of u + p = M a + B v is {law.pooled:.2f} "
             "over all axes",

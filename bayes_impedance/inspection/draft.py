@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from bayes_impedance.config import Columns, LogConfig, as_yaml, parse_config
+from bayes_impedance.config import LogConfig, as_yaml, parse_config
 from bayes_impedance.errors import LogError
 from bayes_impedance.inspection.findings import InRecording
 from bayes_impedance.inspection.guess import (
@@ -28,8 +28,6 @@ from bayes_impedance.recording.plausibility import VelocityMismatch, VelocityUnr
 
 #: Taken where nothing tells how far samples are apart [Hz].
 PLACEHOLDER_RATE = 100.0
-#: A law of the robot that explains less is not worth proposing.
-LEAST_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -68,22 +66,24 @@ def _guessed_log(files: Sequence[Path]) -> tuple[dict[str, Any], list[str]]:
     (opened,) = open_files(files[:1], LogConfig())
     found = _relative(guess_columns(_candidates(opened)))
     if "position" not in found:
-        for table in opened.tables:
-            # Formats that know what they sought say so.
-            raise next(iter(table.absent.values()), _nameless(opened.tables[0]))
-    columns = {key: name for key, name in found.items() if name != Columns.model_fields[key].default}
-    stated = {key: name for key, name in columns.items() if name not in _defaults(opened, key)}
+        table = opened.tables[0]
+        # Formats that know what they sought say so.
+        raise next(iter(table.absent.values()), _nameless(table))
+    # What opening found on its own need not be stated.
+    stated = {key: name for key, name in found.items() if name != getattr(opened.config.columns, key)}
     log: dict[str, Any] = {"columns": stated} if stated else {}
-    (opened,) = open_files(files[:1], LogConfig.model_validate({"columns": stated, **_TIMELESS}))
+    (opened,) = open_files(
+        files[:1], LogConfig.model_validate({"columns": stated, "sampling_rate": PLACEHOLDER_RATE})
+    )
     table = opened.tables[0]
-    position = _array(table, found["position"])
+    values = _arrays(table, {key: found[key] for key in ("position", "velocity", "time") if key in found})
+    position = values["position"]
     remarks = []
     units = {"position": guess_length_unit(position)}
     if "time" in found:
-        units["time"] = guess_time_unit(_array(table, found["time"])[:, 0])
+        units["time"] = guess_time_unit(values["time"][:, 0])
     elif not table.timed:
-        velocity = _array(table, found["velocity"]) if "velocity" in found else None
-        rate = None if velocity is None else guess_sampling_rate(position, velocity)
+        rate = guess_sampling_rate(position, values["velocity"]) if "velocity" in values else None
         log["columns"] = {"time": None} | stated
         log["sampling_rate"] = round(PLACEHOLDER_RATE if rate is None else rate, 1)
         remarks.append(
@@ -113,20 +113,11 @@ def _candidates(opened: Opened) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def _defaults(opened: Opened, key: str) -> tuple[str, ...]:
-    """What opening the file found on its own, and need not be stated."""
-    return (str(getattr(opened.config.columns, key)),)
-
-
 def _nameless(table: Table) -> LogError:
     return LogError(
         f"{table.source}: expected names such as position_x, x or pos, found none that looks like a position; name the "
         "columns in a configuration"
     )
-
-
-#: Opens a file whether or not a column of time was found.
-_TIMELESS: Mapping[str, Any] = {"sampling_rate": PLACEHOLDER_RATE}
 
 
 def _relative(found: Mapping[str, str]) -> dict[str, str]:
@@ -141,15 +132,20 @@ def _relative(found: Mapping[str, str]) -> dict[str, str]:
     return {key: name.removeprefix(prefix) for key, name in found.items() if name.startswith(prefix)}
 
 
-def _array(table: Table, template: str) -> Array:
-    """Numbers of the columns that a template names, `(n, c)`; what is none is NaN."""
-    names = [name for axis in AXES if (name := of_axis(template, axis)) in table.columns]
-    names = list(dict.fromkeys(names))
-    series = {name: column for stream in table.load(names, ()) for name, column in stream.columns.items()}
-    numbers = [pd.to_numeric(series[name], errors="coerce").to_numpy(dtype=np.float64) for name in names]
-    together = np.stack(numbers, axis=1)
-    known: Array = together[np.isfinite(together).all(axis=1)]
-    return known
+def _arrays(table: Table, templates: Mapping[str, str]) -> dict[str, Array]:
+    """Numbers of the columns that templates name, `(n, c)` each, read at once, without rows that hold what is none."""
+    names = {
+        key: list(dict.fromkeys(name for axis in AXES if (name := of_axis(template, axis)) in table.columns))
+        for key, template in templates.items()
+    }
+    wanted = list(dict.fromkeys(name for own in names.values() for name in own))
+    series = {name: column for stream in table.load(wanted, ()) for name, column in stream.columns.items()}
+    arrays = {}
+    for key, own in names.items():
+        numbers = [pd.to_numeric(series[name], errors="coerce").to_numpy(dtype=np.float64) for name in own]
+        together = np.stack(numbers, axis=1)
+        arrays[key] = together[np.isfinite(together).all(axis=1)]
+    return arrays
 
 
 def _add_repairs(content: dict[str, Any], inspection: Inspection) -> None:
@@ -202,7 +198,7 @@ def _device(inspection: Inspection) -> str:
     law, log = inspection.law, inspection.log
     if law is None or log is None or inspection.config.device is not None:
         return ""
-    if law.pooled < LEAST_SHARE or not law.mass_determined.all():
+    if not law.holds or not law.mass_determined.all():
         return ""
     mass = ", ".join(f"{axis}: {value:.3g}" for axis, value in zip(log.axes, law.mass, strict=True))
     damping = ", ".join(f"{axis}: {value:.3g}" for axis, value in zip(log.axes, law.damping, strict=True))

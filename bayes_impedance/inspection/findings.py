@@ -52,7 +52,7 @@ def look_at(reading: Reading) -> list[Finding]:
         >>> [finding.sentence.split(":")[0] for finding in look_at(reading)]
         ['force_x']
     """
-    samples = middle_of(reading.sensed)
+    samples = reading.sensed.at(middle(len(reading.sensed.time)))
     found: list[Finding] = []
     for key in ("position", "velocity", "acceleration", "force"):
         if key in samples.values:
@@ -93,11 +93,10 @@ def gathered(by_recording: Sequence[tuple[str, Sequence[Finding]]]) -> list[Find
     ]
 
 
-def middle_of(samples: Samples) -> Samples:
-    """At most ENOUGH samples, from the middle."""
-    surplus = max(0, len(samples.time) - ENOUGH)
-    part = slice(surplus // 2, len(samples.time) - (surplus - surplus // 2))
-    return Samples(samples.time[part], samples.rows, {key: v[part] for key, v in samples.values.items()})
+def middle(n: int) -> slice:
+    """At most ENOUGH of `n` samples, from the middle."""
+    surplus = max(0, n - ENOUGH)
+    return slice(surplus // 2, n - (surplus - surplus // 2))
 
 
 def _of_quantity(key: str, values: Array, axes: Sequence[str]) -> Iterator[Finding]:

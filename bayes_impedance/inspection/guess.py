@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from bayes_impedance.log import AXES, Array
+from bayes_impedance.readers.columns import of_axis
 
 #: What people call each vector, the likeliest name first; an empty stem is the bare axis.
 STEMS: dict[str, tuple[str, ...]] = {
@@ -53,7 +54,7 @@ def guess_columns(names: Sequence[str]) -> dict[str, str]:
         template = next((t for stem in stems for t in _templates(stem, left)), None)
         if template is not None:
             found[quantity] = template
-            taken = {_of_axis(template, axis) for axis in AXES}
+            taken = {of_axis(template, axis) for axis in AXES}
             left = [name for name in left if name not in taken]
     for quantity, words in NAMES.items():
         by_word = {re.split(r"[/.]", name)[-1].lower(): name for name in reversed(left)}
@@ -80,7 +81,7 @@ def _templates(stem: str, names: Sequence[str]) -> Iterator[str]:
                 continue
             prefix, own = match.groups()
             template = prefix + _with_axis(own, expected)
-            found[template] = sum(_of_axis(template, axis) in names for axis in AXES)
+            found[template] = sum(of_axis(template, axis) in names for axis in AXES)
     return iter(sorted(found, key=lambda template: -found[template]))
 
 
@@ -90,10 +91,6 @@ def _with_axis(own: str, expected: str) -> str:
         return own[: -len("[0]")] + "[{index}]"
     start = expected.index("{axis}")
     return own[:start] + "{axis}" + own[start + 1 :]
-
-
-def _of_axis(template: str, axis: str) -> str:
-    return template.replace("{axis}", axis).replace("{index}", str(AXES.index(axis)))
 
 
 def guess_time_unit(time: Array) -> str:

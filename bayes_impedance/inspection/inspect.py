@@ -10,7 +10,7 @@ from pathlib import Path
 
 from bayes_impedance.config import ClockConfig, Config, Smoother
 from bayes_impedance.errors import BayesImpedanceError, BayesImpedanceWarning, LogError
-from bayes_impedance.inspection.findings import ENOUGH, gathered, look_at, of_clock
+from bayes_impedance.inspection.findings import gathered, look_at, middle, of_clock
 from bayes_impedance.log import InteractionLog, Trial
 from bayes_impedance.preprocessing import PreparedLog, prepare
 from bayes_impedance.preprocessing.bandwidth import SmootherEffect, smoother_effect
@@ -67,7 +67,8 @@ def inspect_recordings(files: Sequence[Path], config: Config) -> Inspection:
             result, log = _as_read(result, opened)
         except BayesImpedanceError as error:
             return replace(result, refusal=error, repairs=tuple(repairs))
-    result = replace(result, log=log, law=_law(log), lag=_lag(log))
+    law, lag = _answers(log)
+    result = replace(result, log=log, law=law, lag=lag)
     with _heard(repairs):
         try:
             result = replace(result, prepared=prepare(log, config.preprocessing))
@@ -128,28 +129,22 @@ def _clocks(readings: Sequence[Reading]) -> dict[str, ClockReport]:
     return clocks
 
 
-def _law(log: InteractionLog) -> DeviceLaw | None:
-    """That of the longest trial."""
+def _answers(log: InteractionLog) -> tuple[DeviceLaw | None, LagEstimate | None]:
+    """How motion and force of the longest trial belong together: the robot's law, and the lag of force."""
     trial = max((trial for trial in log.trials if trial.force is not None), key=_length, default=None)
-    if trial is None or trial.force is None:
-        return None
+    if trial is None:
+        return None, None
     trial = _middle(trial)
     assert trial.force is not None
+    lag = estimate_lag(trial.time, trial.position, trial.force, perturbation=trial.perturbation)
     try:
-        return fit_device_law(
+        law = fit_device_law(
             trial.time, trial.velocity, trial.force, trial.perturbation, position=trial.position
         )
     except LogError:
-        return None
-
-
-def _lag(log: InteractionLog) -> LagEstimate | None:
-    trial = max((trial for trial in log.trials if trial.force is not None), key=_length, default=None)
-    if trial is None or trial.force is None:
-        return None
-    trial = _middle(trial)
-    assert trial.force is not None
-    return estimate_lag(trial.time, trial.position, trial.force, perturbation=trial.perturbation)
+        # Too short to tell.
+        return None, lag
+    return law, lag
 
 
 def _length(trial: Trial) -> int:
@@ -157,8 +152,7 @@ def _length(trial: Trial) -> int:
 
 
 def _middle(trial: Trial) -> Trial:
-    surplus = max(0, trial.n_samples - ENOUGH)
-    part = slice(surplus // 2, trial.n_samples - (surplus - surplus // 2))
+    part = middle(trial.n_samples)
     cut = {
         name: value[part]
         for name in ("time", "position", "velocity", "force", "perturbation", "repetition")

@@ -7,14 +7,13 @@ import warnings
 from collections.abc import Sequence
 
 from bayes_impedance.config import Columns, LogConfig
+from bayes_impedance.config.log import VECTOR_COLUMNS
 from bayes_impedance.errors import LogError, LogWarning
 from bayes_impedance.log import AXES, TRUTH_COLUMN, VECTORS
 from bayes_impedance.readers.cells import is_optional
 from bayes_impedance.readers.table import Table
 
 TIMES = ("time", "force_time")
-#: Quantities of which each axis has a column of its own.
-BY_AXIS = (*VECTORS, "torque")
 #: Columns that only make up the force of the human, where the configuration asks for that.
 WRENCH = ("torque", "orientation")
 
@@ -93,7 +92,7 @@ def _names(columns: Columns, key: str, axes: tuple[str, ...]) -> tuple[str, ...]
     value = getattr(columns, key)
     if value is None or isinstance(value, tuple):
         return value
-    return tuple(of_axis(value, axis) for axis in axes) if key in BY_AXIS else (value,)
+    return tuple(of_axis(value, axis) for axis in axes) if key in VECTOR_COLUMNS else (value,)
 
 
 def _question_half_axes(table: Table, columns: Columns, forceless: bool) -> None:

@@ -40,10 +40,15 @@ class DeviceLaw:
         return self.mass > SURE * self.mass_error
 
     @property
+    def holds(self) -> bool:
+        """Whether the robot answers force by a mass and a damping: they explain half of the variance over all axes."""
+        return self.pooled >= SMALLEST_SHARE
+
+    @property
     def sign(self) -> Sign:
         """What the damping says about the sign of the force: a robot does not drive itself."""
         sure = np.abs(self.damping) > SURE_OF_SIGN * self.damping_error
-        if self.pooled < SMALLEST_SHARE or not sure.any():
+        if not self.holds or not sure.any():
             return Sign.UNKNOWN
         if (self.damping[sure] > 0).all():
             return Sign.EXPECTED

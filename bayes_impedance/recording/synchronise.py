@@ -9,11 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import PchipInterpolator
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Slerp
 
 from bayes_impedance.errors import LogError, LogWarning
 from bayes_impedance.log import Array, Integers
 from bayes_impedance.recording.offset import ClockOffset
+from bayes_impedance.recording.wrench import rotations
 
 #: Two clocks that arrivals put this close [s] are taken for one: messages differ by more in their shortest way.
 SAME_CLOCK = 2e-3
@@ -167,7 +168,7 @@ def turned_to(at: Array, time: Array, columns: Array, rotation: str) -> Array:
     From sample to sample about one axis at a steady rate, the shorter way: angles wrap, and components of a
     quaternion have two signs. Angles come out within ±π.
     """
-    between = Slerp(time, as_rotation(columns, rotation))(at)
+    between = Slerp(time, rotations(columns, rotation))(at)
     if rotation.startswith("quaternion"):
         scalar_first = rotation.endswith("wxyz")
         quaternion: Array = between.as_quat(scalar_first=scalar_first)
@@ -177,13 +178,6 @@ def turned_to(at: Array, time: Array, columns: Array, rotation: str) -> Array:
         warnings.filterwarnings("ignore", message="Gimbal lock detected", category=UserWarning)
         angles: Array = between.as_euler(rotation)  # type: ignore[call-overload]  # axes that the configuration checked
     return angles
-
-
-def as_rotation(columns: Array, rotation: str) -> Rotation:
-    """Orientations of `columns (n, 3 or 4)`: angles [rad] about the axes of `rotation`, or a quaternion."""
-    if rotation.startswith("quaternion"):
-        return Rotation.from_quat(columns, scalar_first=rotation.endswith("wxyz"))
-    return Rotation.from_euler(rotation, columns)
 
 
 def _known(stream: Stream, place: str) -> Stream:
