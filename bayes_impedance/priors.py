@@ -186,7 +186,7 @@ def build_force_model(config: Config, features: FeatureMap) -> ForceModel:
     if model.residual is not None:
         dims = features.active_dims(model.residual.input)
         residual = _stationary(
-            "squared_exponential", model.residual.input, features, model.residual.length_scale,
+            model.residual.kernel, model.residual.input, features, model.residual.length_scale,
             model.residual.sd, batch, dims,
         )  # fmt: skip
         if model.residual.offset_sd is not None:

@@ -116,6 +116,14 @@ KERNELS = (
     "kernels.impedance",
     "kernels",
 )
+ENGINES = (
+    "engines.dense",
+    "engines.closed_loop",
+    "engines.pointwise",
+    "engines.given_impedance",
+    "engines.given_dense",
+    "engines",
+)
 COMMANDS = (
     "commands.inspection_tables",
     "commands.inspect",
@@ -138,7 +146,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             KERNELS,
             {"features"},
             {"priors"},
-            {"engines", "engines.dense", "engines.closed_loop", "engines.pointwise"},
+            set(ENGINES),
             {"training"},
             {"posterior"},
             {
@@ -169,7 +177,7 @@ FAMILIES = (
     PREPROCESSING,
     READERS,
     KERNELS,
-    ("engines.dense", "engines.closed_loop", "engines.pointwise", "engines"),
+    ENGINES,
     BASELINES,
     SIMULATION,
     COMMANDS,

@@ -2,19 +2,41 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from bayes_impedance.config.sections import Component, Section
 
+#: Engines by name; `auto` takes the cheapest that computes the same quantity exactly.
+EngineName = Literal["auto", "dense", "markov", "lowrank"]
+#: What becomes of stiffness, damping and mass: integrated out to second order, or estimated as functions.
+ImpedanceInference = Literal["moments", "map"]
+
 
 class EngineConfig(Section):
-    """The dense engine. `jitter` is relative to the mean prior variance of force."""
+    """How the likelihood of the forces is computed.
 
-    name: Literal["dense"] = "dense"
+    `impedance: moments` integrates stiffness, damping and mass out to second order, which only the dense engine does;
+    `map` estimates them as functions, with a Laplace covariance, from the likelihood given impedance, which every
+    engine computes. `inducing` inputs carry each such function. `max_samples` and `jitter`, relative to the mean prior
+    variance of force, are of the dense engine.
+    """
+
+    name: EngineName = "auto"
+    impedance: ImpedanceInference = "moments"
+    inducing: int = Field(default=12, ge=2, le=200)
     max_samples: int = Field(default=4000, ge=2)
     jitter: float = Field(default=1e-10, ge=0, le=1e-3)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.impedance == "moments" and self.name in ("markov", "lowrank"):
+            raise ValueError(
+                f"name: expected auto or dense with impedance: moments, got {self.name}, which computes the likelihood "
+                "given impedance; set engine.impedance=map"
+            )
+        return self
 
 
 class TrainingConfig(Section):

@@ -27,6 +27,10 @@ TrajectoryInput = Literal["time", "phase", "position", "position_velocity"]
 TrajectoryMean = Literal["equilibrium", "reference", "trial_average", "constant"]
 #: Covariance of the desired trajectory.
 ProfileName = Literal["squared_exponential", "rational_quadratic", "matern52", "matern72", "matern92"]
+#: Covariance of the residual force.
+ResidualProfileName = Literal["squared_exponential", "matern12", "matern32", "matern52"]
+#: Whether stiffness, damping and mass are numbers of each axis, or symmetric positive definite matrices.
+Coupling = Literal["independent", "coupled"]
 
 #: Above this log-SD the product of a log-normal stiffness and a displacement is so heavy-tailed
 #: (kurtosis 3 exp(4 s²)) that a Gaussian with the same two moments misleads.
@@ -45,7 +49,8 @@ class LengthScales(Section):
 class ImpedancePrior(Section):
     """Prior of damping or stiffness, a process over `input`; without inputs it is one constant a group.
 
-    `log_gp`: log w ~ GP(log median, log_sd²); `gp`: w ~ GP(mean, sd²). `level` is that median or mean.
+    `log_gp`: log w ~ GP(log median, log_sd²); `gp`: w ~ GP(mean, sd²). `level` is that median or mean. `coupling` is
+    the typical size of K_xy/√(K_xx K_yy) before any data, where axes are coupled.
     """
 
     prior: Literal["log_gp", "gp"] = "log_gp"
@@ -54,6 +59,7 @@ class ImpedancePrior(Section):
     sd: Scale | None = None
     input: tuple[Component, ...] = ()
     length_scale: LengthScales = LengthScales()
+    coupling: Scale = learned(0.3)
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -91,17 +97,19 @@ class DampingPrior(ImpedancePrior):
 
 
 class MassPrior(Section):
-    """Mass m ~ N(level, sd²) [kg], one for each group."""
+    """Mass m ~ N(level, sd²) [kg], one for each group; `coupling` as for stiffness."""
 
     level: Scale = learned(1.5, 0.7)
     sd: Scale = Hyperparameter(median=0.3, fixed=True)
+    coupling: Scale = learned(0.3)
 
 
 class DesiredTrajectoryPrior(Section):
-    """Desired trajectory x_d ~ GP(mean, kernel over θ); `sd` [m]."""
+    """Desired trajectory x_d ~ GP(mean, kernel over θ); `sd` [m]. `periodic` joins the ends of the phase."""
 
     mean: TrajectoryMean = "equilibrium"
     kernel: ProfileName = "squared_exponential"
+    periodic: bool = False
     sd: Scale = learned(0.02)
     length_scale: LengthScales = LengthScales()
     shape: Scale = Hyperparameter(median=1.0, fixed=True)
@@ -110,8 +118,9 @@ class DesiredTrajectoryPrior(Section):
 
 
 class ResidualPrior(Section):
-    """Residual force ũ ~ GP(0, SE(`sd`) over `input`) plus a constant offset a trial ~ N(0, `offset_sd`²) [N]."""
+    """Residual force ũ ~ GP(0, `kernel` over `input`) plus a constant offset a trial ~ N(0, `offset_sd`²) [N]."""
 
+    kernel: ResidualProfileName = "squared_exponential"
     sd: Scale = learned(1.0)
     input: tuple[Component, ...] = ("position", "velocity")
     length_scale: LengthScales = LengthScales()
@@ -128,10 +137,12 @@ class ResidualPrior(Section):
 class ModelConfig(Section):
     """Priors of every latent of u = Σ_j w_j e⁽ʲ⁾ + ũ + ε.
 
+    `axes: coupled` makes stiffness, damping and mass symmetric positive definite matrices across axes.
     `position_noise_sd` [m]: white noise of the recorded positions, whose share that the smoother leaves in position,
     velocity and acceleration is part of the covariance of the force; None leaves it out.
     """
 
+    axes: Coupling = "independent"
     trajectory_input: TrajectoryInput = "time"
     drop_acceleration: bool = False
     desired_trajectory: DesiredTrajectoryPrior = DesiredTrajectoryPrior()
@@ -148,6 +159,11 @@ class ModelConfig(Section):
             raise ValueError(
                 "position_noise_sd: with desired_trajectory.mean: equilibrium the position cancels from x_d − x, and "
                 "its noise with it; set position_noise_sd to null, or take another mean"
+            )
+        if self.desired_trajectory.periodic and self.trajectory_input != "phase":
+            raise ValueError(
+                "desired_trajectory.periodic: expected trajectory_input: phase with it, whose ends it joins, got "
+                f"{self.trajectory_input}; remove one of the two"
             )
         if self.drop_acceleration and self.trajectory_input != "position_velocity":
             raise ValueError(

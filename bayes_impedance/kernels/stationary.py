@@ -102,20 +102,21 @@ def _bessel_polynomial(order: int, z: Tensor) -> Tensor | float:
 
 
 class Matern(Profile):
-    """Matérn with ν = 5/2, 7/2 or 9/2: κ⁽ⁿ⁾ = (−2ν)ⁿ G_{ν−n}(z) / G_ν(0), G_ν = z^ν K_ν(z), z = √(4νs).
+    """Matérn with ν = 1/2 … 9/2: κ⁽ⁿ⁾ = (−2ν)ⁿ G_{ν−n}(z) / G_ν(0), G_ν = z^ν K_ν(z), z = √(4νs).
 
     For ν = 5/2 the third and fourth derivative diverge as z → 0, yet every product in which
     they occur vanishes there; so z is kept off zero by 1e-12, where those products are below rounding.
+    Below ν = 5/2 no desired trajectory has an acceleration: these are for residual forces.
     """
 
     exact_distance: ClassVar[bool] = True
 
     def __init__(self, nu: float) -> None:
-        if nu not in (2.5, 3.5, 4.5):
-            raise ValueError(f"nu: expected 2.5, 3.5 or 4.5 (twice differentiable Matérn), got {nu!r}")
+        if nu not in (0.5, 1.5, 2.5, 3.5, 4.5):
+            raise ValueError(f"nu: expected 0.5, 1.5, 2.5, 3.5 or 4.5, got {nu!r}")
         self.nu = nu
         self.degree = round(nu - 0.5)
-        self.norm = {2: 3.0, 3: 15.0, 4: 105.0}[self.degree]
+        self.norm = (1.0, 1.0, 3.0, 15.0, 105.0)[self.degree]
 
     def _z(self, s: Tensor) -> Tensor:
         return torch.sqrt((4.0 * self.nu) * s.clamp_min(1e-24))
@@ -126,7 +127,16 @@ class Matern(Profile):
         return torch.exp(-z) * _bessel_polynomial(self.degree, z) / self.norm
 
     def derivatives(self, s: Tensor, shape: Tensor | None = None) -> ProfileDerivatives:
-        """Common factor e^{−z}."""
+        """Common factor e^{−z}.
+
+        Raises:
+            ValueError: ν < 5/2, where a process has no acceleration.
+        """
+        if self.degree < 2:
+            raise ValueError(
+                f"expected a Matérn profile with nu of 2.5 or more, whose process has an acceleration, got {self.nu}; "
+                "take matern52"
+            )
         z = self._z(s)
         ratios = [
             (-2.0 * self.nu) ** n / self.norm * _bessel_polynomial(self.degree - n, z) for n in range(5)
@@ -138,6 +148,8 @@ class Matern(Profile):
 PROFILES: dict[str, Profile] = {
     "squared_exponential": SquaredExponential(),
     "rational_quadratic": RationalQuadratic(),
+    "matern12": Matern(0.5),
+    "matern32": Matern(1.5),
     "matern52": Matern(2.5),
     "matern72": Matern(3.5),
     "matern92": Matern(4.5),
