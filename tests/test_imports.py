@@ -122,6 +122,13 @@ ENGINES = (
     "engines.pointwise",
     "engines.given_impedance",
     "engines.given_dense",
+    "engines.markov.state_space",
+    "engines.markov.recursions",
+    "engines.markov.arrangement",
+    "engines.markov.likelihood",
+    "engines.markov.observation",
+    "engines.markov.engine",
+    "engines.markov",
     "engines",
 )
 COMMANDS = (
@@ -193,7 +200,7 @@ FREE = ("kernels.", "evaluation.metrics", "errors")
 CONFINED = {
     "typer": {"cli", "commands.inspect", "commands.simulate", "commands.plan"},
     "rich": {"cli", "terminal", *COMMANDS} - {"commands"},
-    "numba": {"simulation.dynamics"},
+    "numba": {"simulation.dynamics", "engines.markov.state_space", "engines.markov.recursions"},
     "matplotlib": {"plotting"},
     "pydantic": set(CONFIG) - {"config"},
     "yaml": {"config.loading"},

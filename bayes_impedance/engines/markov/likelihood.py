@@ -1,0 +1,95 @@
+"""Log likelihood of sequences as a torch function of the arrays that the filter takes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from bayes_impedance.engines.markov.arrangement import Sequences
+from bayes_impedance.engines.markov.recursions import gradients, log_likelihoods, smooth, stored_length
+from bayes_impedance.errors import NotPositiveDefiniteError
+
+
+class FilterLikelihood(torch.autograd.Function):
+    """log p(y) of every sequence, `(filters, sequences)` [nats]; filters share the order of samples, n of them.
+
+    Args of `apply`: z `(filters, n, blocks)`, h `(filters, n, axes, 3 axes)` [N], c `(filters, axes, terms)` [N],
+    y `(filters, n, axes)` [N], r `(filters, axes)` [N²], as in `recursions`, then the `Sequences`.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, z: Tensor, h: Tensor, c: Tensor, y: Tensor, r: Tensor, sequences: Sequences
+    ) -> Tensor:
+        """One pass of the filter.
+
+        Raises:
+            NotPositiveDefiniteError: rounding left no positive variance of a force.
+        """
+        ctx.sequences = sequences
+        arrays = [value.detach().contiguous() for value in (z, h, c, y, r)]
+        filters = run_filters(arrays, sequences, any(ctx.needs_input_grad))
+        ctx.stored = [stored for _, stored in filters]
+        ctx.save_for_backward(*arrays)
+        return torch.from_numpy(np.stack([values for values, _ in filters]))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, weights: Tensor) -> tuple[Tensor | None, ...]:
+        """The reverse sweep."""
+        arrays = ctx.saved_tensors
+        results = tuple(torch.zeros_like(value) for value in arrays)
+        for i, stored in enumerate(ctx.stored):
+            data = tuple(value[i].numpy() for value in arrays)
+            out = tuple(value[i].numpy() for value in results)
+            gradients(ctx.sequences.plan, data, stored, weights[i].contiguous().numpy(), out)
+        return *results, None
+
+
+def run_filters(
+    arrays: list[Tensor], sequences: Sequences, store: bool
+) -> list[tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]]:
+    """Log likelihoods `(sequences,)` of every filter, and the states that a way back starts from.
+
+    Raises:
+        NotPositiveDefiniteError: rounding left no positive variance of a force.
+    """
+    plan = sequences.plan
+    result = []
+    for i in range(arrays[0].shape[0]):
+        data = tuple(value[i].numpy() for value in arrays)
+        stored = np.zeros(stored_length(plan[0], plan[1]) if store else 0)
+        values = np.zeros(len(sequences.group))
+        failed = log_likelihoods(plan, data, stored, values)
+        if failed >= 0:
+            raise NotPositiveDefiniteError(
+                f"the variance of force {failed} of {len(sequences.order)} in the order of theta, given those before it, "
+                "is not positive; raise model.noise_sd, or check impedance and hyperparameters for values that are not "
+                "finite"
+            )
+        result.append((values, stored))
+    return result
+
+
+def smoothed_states(
+    arrays: list[Tensor], sequences: Sequences, targets: np.ndarray[Any, Any]
+) -> tuple[Tensor, Tensor]:
+    """Posterior mean `(filters, m, states)` and covariance of the states of the blocks at m samples.
+
+    `targets` `(n,)`: the row of the result at each sample of the sequences, −1 for none.
+
+    Raises:
+        NotPositiveDefiniteError: rounding left no positive variance of a force.
+    """
+    width, count = int(sequences.plan[4].sum()), int((targets >= 0).sum())
+    arrays = [value.contiguous() for value in arrays]
+    means = torch.zeros(arrays[0].shape[0], count, width, dtype=torch.float64)
+    covariances = torch.zeros(*means.shape, width, dtype=torch.float64)
+    for i, (_, stored) in enumerate(run_filters(arrays, sequences, store=True)):
+        data = tuple(value[i].numpy() for value in arrays)
+        smooth(sequences.plan, data, stored, targets, means[i].numpy(), covariances[i].numpy())
+    return means, covariances
