@@ -221,7 +221,8 @@ def model_components(model: ModelConfig) -> tuple[Component, ...]:
 def _xi_components(model: ModelConfig) -> tuple[Component, ...]:
     """Components of ξ, each once."""
     residual = () if model.residual is None else model.residual.input
-    return tuple(dict.fromkeys((*model.stiffness.input, *model.damping.input, *residual)))
+    impedance = (*model.stiffness.input, *model.damping.input, *model.mass.input)
+    return tuple(dict.fromkeys((*impedance, *residual)))
 
 
 def check_combination(config: Config, log: PreparedLog) -> None:

@@ -18,7 +18,7 @@ from gpytorch.likelihoods import GaussianLikelihood
 from gpytorch.priors import NormalPrior
 from torch import Tensor
 
-from bayes_impedance.config import Config, Hyperparameter, ImpedancePrior, LengthScales
+from bayes_impedance.config import Config, Hyperparameter, ImpedancePrior, LengthScales, MassPrior
 from bayes_impedance.config.model import LARGEST_LOG_SD
 from bayes_impedance.config.sections import Component
 from bayes_impedance.errors import ConfigurationError
@@ -176,12 +176,7 @@ def build_force_model(config: Config, features: FeatureMap) -> ForceModel:
     )
     stiffness = _impedance(model.stiffness, features, batch)
     damping = _impedance(model.damping, features, batch)
-    mass = ImpedanceProcess(
-        StationaryKernel(num_dims=0, batch_shape=batch, sd_prior=_prior(model.mass.sd)),
-        law="gaussian",
-        level_prior=_prior(model.mass.level),
-        batch_shape=batch,
-    )
+    mass = _impedance(model.mass, features, batch)
     residual = None
     if model.residual is not None:
         dims = features.active_dims(model.residual.input)
@@ -212,7 +207,7 @@ def build_force_model(config: Config, features: FeatureMap) -> ForceModel:
             _entry("damping.level", "Ns/m", impedance.damping, "level", model.damping.level),
             *_process_entries("damping", "Ns/m", impedance.damping, model.damping, features),
             _entry("mass.level", "kg", impedance.mass, "level", model.mass.level),
-            _entry("mass.sd", "kg", impedance.mass.covariance, "sd", model.mass.sd),
+            *_process_entries("mass", "kg", impedance.mass, model.mass, features),
             _entry("desired_trajectory.sd", "m", impedance.trajectory, "sd", model.desired_trajectory.sd),
             _length_scales(
                 "desired_trajectory", impedance.trajectory, model.desired_trajectory.length_scale,
@@ -273,9 +268,15 @@ def _stationary(
     )
 
 
-def _impedance(prior: ImpedancePrior, features: FeatureMap, batch: torch.Size) -> ImpedanceProcess:
+def _is_log(prior: ImpedancePrior | MassPrior) -> bool:
+    return bool(prior.input) if isinstance(prior, MassPrior) else prior.prior == "log_gp"
+
+
+def _impedance(
+    prior: ImpedancePrior | MassPrior, features: FeatureMap, batch: torch.Size
+) -> ImpedanceProcess:
     specs = _length_scale_specs(prior.length_scale, prior.input, features)
-    learned_log_sd = prior.prior == "log_gp" and not prior.scale.fixed
+    learned_log_sd = _is_log(prior) and not prior.scale.fixed
     covariance = StationaryKernel(
         num_dims=len(specs),
         batch_shape=batch,
@@ -285,7 +286,7 @@ def _impedance(prior: ImpedancePrior, features: FeatureMap, batch: torch.Size) -
         sd_constraint=Interval(0.0, LARGEST_LOG_SD) if learned_log_sd else None,
         lengthscale_prior=_prior(*specs) if specs else None,
     )
-    law: Law = "log_gaussian" if prior.prior == "log_gp" else "gaussian"
+    law: Law = "log_gaussian" if _is_log(prior) else "gaussian"
     return ImpedanceProcess(covariance, law, level_prior=_prior(prior.level), batch_shape=batch)
 
 
@@ -333,10 +334,9 @@ def _length_scales(
 
 
 def _process_entries(
-    name: str, unit: str, process: ImpedanceProcess, prior: ImpedancePrior, features: FeatureMap
+    name: str, unit: str, process: ImpedanceProcess, prior: ImpedancePrior | MassPrior, features: FeatureMap
 ) -> list[Entry]:
-    log = prior.prior == "log_gp"
-    scale_name, scale_unit = ("log_sd", "1") if log else ("sd", unit)
+    scale_name, scale_unit = ("log_sd", "1") if _is_log(prior) else ("sd", unit)
     entries = [_entry(f"{name}.{scale_name}", scale_unit, process.covariance, "sd", prior.scale)]
     if prior.input:
         entries.append(_length_scales(name, process.covariance, prior.length_scale, prior.input, features))

@@ -131,6 +131,17 @@ ENGINES = (
     "engines.markov",
     "engines",
 )
+IMPEDANCE_FUNCTIONS = (
+    "impedance_functions.symmetric",
+    "impedance_functions.inducing",
+    "impedance_functions.function",
+    "impedance_functions.density",
+    "impedance_functions.laplace",
+    "impedance_functions.evidence",
+    "impedance_functions.fit",
+    "impedance_functions.conditioned",
+    "impedance_functions",
+)
 COMMANDS = (
     "commands.inspection_tables",
     "commands.inspect",
@@ -154,6 +165,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             {"features"},
             {"priors"},
             set(ENGINES),
+            IMPEDANCE_FUNCTIONS,
             {"training"},
             {"posterior"},
             {
@@ -185,6 +197,7 @@ FAMILIES = (
     READERS,
     KERNELS,
     ENGINES,
+    IMPEDANCE_FUNCTIONS,
     BASELINES,
     SIMULATION,
     COMMANDS,

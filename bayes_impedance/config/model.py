@@ -97,11 +97,27 @@ class DampingPrior(ImpedancePrior):
 
 
 class MassPrior(Section):
-    """Mass m ~ N(level, sd²) [kg], one for each group; `coupling` as for stiffness."""
+    """Mass m ~ N(level, sd²) [kg], one for each group; `coupling` as for stiffness.
+
+    Where it depends on an `input`, as that of an arm does on posture, log m ~ GP(log median, log_sd²) instead.
+    """
 
     level: Scale = learned(1.5, 0.7)
     sd: Scale = Hyperparameter(median=0.3, fixed=True)
+    log_sd: Scale = learned(0.2, 0.5)
+    input: tuple[Component, ...] = ()
+    length_scale: LengthScales = LengthScales()
     coupling: Scale = learned(0.3)
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        check_distinct(self.input)
+        return self
+
+    @property
+    def scale(self) -> Hyperparameter:
+        """`log_sd` [1] of a mass that depends on an input, `sd` [kg] of one that does not."""
+        return self.log_sd if self.input else self.sd
 
 
 class DesiredTrajectoryPrior(Section):

@@ -1,0 +1,171 @@
+"""Posterior density of impedance functions and of the hyperparameters beside them, given forces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from bayes_impedance.device import Loop
+from bayes_impedance.engines.given_impedance import ConditionalEngine, Processes, diagonal_only
+from bayes_impedance.errors import NotPositiveDefiniteError
+from bayes_impedance.features import Features
+from bayes_impedance.impedance_functions.function import ImpedanceFunction
+from bayes_impedance.priors import Entry, ForceModel
+
+Array = NDArray[np.float64]
+
+#: Hyperparameters of the impedance's own priors: functions carry their levels, and evidence finds the others.
+OF_IMPEDANCE = ("stiffness.", "damping.", "mass.")
+
+
+@dataclass(frozen=True)
+class Designs:
+    """Designs of K, D and M at the same samples."""
+
+    functions: tuple[ImpedanceFunction, ...]
+    designs: tuple[Tensor, ...]
+
+    @classmethod
+    def at(cls, functions: tuple[ImpedanceFunction, ...], inputs: Tensor) -> Designs:
+        """Those at `inputs` `(axes, groups, n, D)`."""
+        return cls(functions, tuple(function.design(inputs) for function in functions))
+
+    def matrices(self, weights: tuple[Tensor, ...]) -> Tensor:
+        """K, D, M, `(groups, n, 3, axes, axes)`."""
+        parts = zip(self.functions, self.designs, weights, strict=True)
+        return torch.stack([function.matrices(design, own) for function, design, own in parts], dim=2)
+
+
+def log_jacobian(loop: Loop, impedance: Tensor, valid: Tensor | None, coupled: bool) -> Tensor:
+    """Σ_n log det ∂(u − Σ_j W_j e^{(j)})/∂u of a closed loop, `(axes, groups)` or `(1, groups)` [nats].
+
+    On a device that answers force, M_r ẍ + D_r ẋ = u + p, the matrix is I + Z M_r⁻¹ with the apparent mass
+    Z = M (I − ½ Δ D_r M_r⁻¹) + ½ Δ D, Δ the time between samples (docs/model.md §6).
+    """
+    _, damping, mass = impedance.unbind(2)
+    step = loop.step[:, None, None, None]
+    device_mass, device_damping = loop.device_mass[:, 0], loop.device_damping[:, 0]
+    # Columns belong to the axis that moves.
+    apparent = mass * (1.0 - 0.5 * step * device_damping / device_mass) + 0.5 * step * damping
+    axes = impedance.shape[-1]
+    answer = torch.eye(axes, dtype=impedance.dtype) + apparent / device_mass
+    if coupled:
+        terms = torch.linalg.slogdet(answer).logabsdet.unsqueeze(0)
+    else:
+        terms = answer.diagonal(dim1=-2, dim2=-1).abs().log().movedim(-1, 0)
+    return (terms if valid is None else terms * valid).sum(-1)
+
+
+class Density:
+    """Log density of weights and hyperparameters as functions of one vector.
+
+    First the weights of each function, `(groups, entries, width)`, then the unconstrained values of the free
+    hyperparameters of desired trajectory, residual force and noise.
+    """
+
+    def __init__(
+        self,
+        model: ForceModel,
+        functions: tuple[ImpedanceFunction, ...],
+        engine: ConditionalEngine,
+        features: Features,
+        coupled: bool,
+        periodic: bool,
+    ) -> None:
+        self.model, self.functions, self.engine, self.features = model, functions, engine, features
+        self.coupled, self.periodic = coupled, periodic
+        self.entries = [
+            entry
+            for entry in model.entries
+            if bool(entry.free.any()) and not entry.name.startswith(OF_IMPEDANCE)
+        ]
+        groups = features.inputs.shape[1]
+        self.shapes = [(groups, len(f.places), f.width) for f in functions]
+        self.weight_count = sum(int(np.prod(shape)) for shape in self.shapes)
+        moves = [entry.free.repeat(entry.raw.shape[0]).numpy() for entry in self.entries]
+        #: Coordinates that are learned: all but components that the configuration fixes.
+        self.free = np.concatenate([np.ones(self.weight_count, dtype=bool), *moves])
+        #: Gradient of a linear term, by which the uncertainty of the weights enters (see `evidence.occam`), and the
+        #: hyperparameters at which it was found: it is local, so a step away from them costs what a hyperprior of
+        #: log-SD 1 would. Where turns have settled that cost is none.
+        self.tilt = np.zeros(len(self.free))
+        self.anchor: Array | None = None
+        self.renew()
+
+    def renew(self) -> None:
+        """Take up changed hyperparameters of the functions' priors."""
+        self.designs = Designs.at(self.functions, self.features.inputs)
+
+    def start(self) -> Array:
+        """Weights at their prior mean, hyperparameters where the model stands."""
+        raws = [entry.raw.detach().reshape(-1).numpy() for entry in self.entries]
+        return np.concatenate([np.zeros(self.weight_count), *raws])
+
+    def weights(self, point: Tensor) -> tuple[Tensor, ...]:
+        """Weights of each function, `(groups, entries, width)`."""
+        sizes = [int(np.prod(shape)) for shape in self.shapes]
+        parts = point[: self.weight_count].split(sizes)
+        return tuple(part.reshape(shape) for part, shape in zip(parts, self.shapes, strict=True))
+
+    def set_hyperparameters(self, point: Array) -> None:
+        """Write those of `point` into the model."""
+        start = self.weight_count
+        with torch.no_grad():
+            for entry in self.entries:
+                stop = start + entry.raw.numel()
+                entry.raw.copy_(torch.from_numpy(point[start:stop]).reshape(entry.raw.shape))
+                start = stop
+
+    @property
+    def processes(self) -> Processes:
+        """Desired trajectory, residual force and noise at the model's hyperparameters."""
+        return Processes.of(self.model, self.periodic)
+
+    def likelihood(self, impedance: Tensor) -> Tensor:
+        """log p(u | W) with the Jacobian of the closed loop, `(axes, groups)` or `(1, groups)` [nats]."""
+        value = self.engine.log_likelihood_given_impedance(self.processes, impedance)
+        loop = self.features.loop
+        if loop is None:
+            return value
+        known = impedance if self.coupled else diagonal_only(impedance)
+        return value + log_jacobian(loop, known, self.features.valid, self.coupled)
+
+    def __call__(self, point: Array) -> tuple[float, Array]:
+        """Log density, tilted, and its gradient.
+
+        Raises:
+            NotPositiveDefiniteError: it is not finite there.
+        """
+        self.set_hyperparameters(point)
+        for entry in self.entries:
+            entry.raw.grad = None
+        free = torch.from_numpy(point[: self.weight_count]).requires_grad_()
+        value = self.likelihood(self.designs.matrices(self.weights(free))).sum()
+        value = value - 0.5 * free.square().sum()
+        for entry in self.entries:
+            value = value + log_hyperprior(entry)
+        value.backward()
+        parts = [free, *(entry.raw for entry in self.entries)]
+        gradient = np.concatenate(
+            [np.zeros(p.numel()) if p.grad is None else p.grad.reshape(-1).numpy() for p in parts]
+        )
+        if not (np.isfinite(gradient).all() and bool(value.isfinite())):
+            raise NotPositiveDefiniteError(
+                "expected a finite likelihood of the forces given impedance, found one that overflows, or its gradient "
+                "does; check log.units, and that the medians under model are of the size that their unit lets expect"
+            )
+        away = np.zeros_like(point)
+        if self.anchor is not None:
+            away[self.weight_count :] = (point - self.anchor)[self.weight_count :]
+        tilted = float(value.detach()) + float(self.tilt @ point) - 0.5 * float(away @ away)
+        return tilted, (gradient + self.tilt - away) * self.free
+
+
+def log_hyperprior(entry: Entry) -> Tensor:
+    """Log density of the logarithms of a hyperparameter's free components over all axes, without constants [nats]."""
+    deviation = (entry.value.log() - entry.medians.log()) / entry.log_sds
+    return -0.5 * (deviation.square() * entry.free).sum()

@@ -1,0 +1,130 @@
+"""The mode of impedance functions and hyperparameters, and the Laplace approximation about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from bayes_impedance.errors import NotPositiveDefiniteError
+from bayes_impedance.impedance_functions import laplace
+from bayes_impedance.impedance_functions.density import Density
+from bayes_impedance.impedance_functions.evidence import occam, update_variation
+
+Array = NDArray[np.float64]
+
+#: Turns of mode and evidence, and the change of a hyperparameter's logarithm below which they end.
+TURNS, SETTLED = 4, 0.05
+#: Iterations before the curvature is looked at, in whose coordinates a climb is several times as short.
+FIRST = 150
+#: What a step costs that leads where the likelihood overflows [nats].
+OUTSIDE = 1e6
+#: Pairs of steps that L-BFGS keeps: the curvature of weights ranges over five decades.
+MEMORY = 30
+RELATIVE_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A maximum of a `Density`: `point` `(size,)`, its log density and the covariance `(free, free)` about it."""
+
+    point: Array
+    log_density: float
+    covariance: Array
+    iterations: int
+    evaluations: int
+    outcome: str
+
+
+def find_mode(
+    density: Density,
+    start: Array,
+    max_iterations: int,
+    gradient_tolerance: float,
+    progress: Callable[[int, float], None] | None = None,
+) -> Mode:
+    """Climb from `start`, and learn how functions vary, in turns; the model keeps the hyperparameters found.
+
+    Raises:
+        NotPositiveDefiniteError: the likelihood is not finite somewhere on the way.
+    """
+    climb = _Climb(density, gradient_tolerance, progress)
+    point = climb(start, None, min(FIRST, max_iterations))
+    precision = _precision(density, point)
+    for _ in range(TURNS):
+        before = point[density.weight_count :]
+        density.tilt, density.anchor = occam(density, point, precision), None
+        point, moved = update_variation(density, point, precision)
+        density.anchor = point
+        density.renew()
+        point = climb(point, precision, max_iterations)
+        precision = _precision(density, point)
+        if max(moved, np.max(np.abs(point[density.weight_count :] - before), initial=0.0)) < SETTLED:
+            break
+    log_density, _ = density(point)
+    return Mode(
+        point, log_density, laplace.covariance(precision), climb.iterations, climb.evaluations, climb.outcome
+    )
+
+
+def _precision(density: Density, point: Array) -> Array:
+    return laplace.precision(lambda at: density(at)[1], point, density.free)
+
+
+class _Climb:
+    """L-BFGS, in coordinates in which the curvature that is known is one."""
+
+    def __init__(
+        self, density: Density, gradient_tolerance: float, progress: Callable[[int, float], None] | None
+    ) -> None:
+        self.density, self.gradient_tolerance, self.progress = density, gradient_tolerance, progress
+        self.iterations = self.evaluations = 0
+        self.outcome = ""
+
+    def __call__(self, start: Array, precision: Array | None, max_iterations: int) -> Array:
+        places = np.flatnonzero(self.density.free)
+        root: Array = np.eye(len(places), dtype=np.float64)
+        if precision is not None:
+            root = np.linalg.cholesky(laplace.covariance(precision))
+        best = -np.inf
+
+        def at(step: Array) -> Array:
+            point = start.copy()
+            point[places] += root @ step
+            return point
+
+        def objective(step: Array) -> tuple[float, Array]:
+            nonlocal best
+            self.evaluations += 1
+            try:
+                value, gradient = self.density(at(step))
+            except NotPositiveDefiniteError:
+                if not np.isfinite(best):
+                    raise
+                return OUTSIDE - best, np.zeros_like(step)
+            best = max(best, value)
+            return -value, -root.T @ gradient[places]
+
+        def count(_: Array) -> None:
+            self.iterations += 1
+            if self.progress is not None:
+                self.progress(self.iterations, best)
+
+        found = minimize(  # type: ignore[call-overload] # the stubs want a tuple of one length
+            objective,
+            np.zeros(len(places)),
+            jac=True,
+            method="L-BFGS-B",
+            callback=count,
+            options={
+                "maxiter": max_iterations,
+                "maxcor": MEMORY,
+                "ftol": RELATIVE_TOLERANCE,
+                "gtol": self.gradient_tolerance,
+            },
+        )
+        self.outcome = str(found.message)
+        return at(found.x)

@@ -1,0 +1,47 @@
+"""Symmetric positive definite matrices by their logarithm, W = exp(S), and how W answers a change of S."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def entries(axes: int, coupled: bool) -> tuple[tuple[int, int], ...]:
+    """Places of the free entries of S: the diagonal, then, where axes couple, what lies above it.
+
+    Example:
+        >>> entries(2, coupled=True), entries(2, coupled=False)
+        (((0, 0), (1, 1), (0, 1)), ((0, 0), (1, 1)))
+    """
+    diagonal = tuple((a, a) for a in range(axes))
+    above = tuple((a, b) for a in range(axes) for b in range(a + 1, axes))
+    return diagonal + above if coupled else diagonal
+
+
+def assemble(values: Tensor, places: tuple[tuple[int, int], ...], axes: int) -> Tensor:
+    """Symmetric matrices `(..., axes, axes)` with `values` `(..., entries)` at `places`."""
+    basis = values.new_zeros(len(places), axes, axes)
+    for e, (a, b) in enumerate(places):
+        basis[e, a, b] = basis[e, b, a] = 1.0
+    return torch.einsum("...e,eab->...ab", values, basis)
+
+
+def exponential(values: Tensor, places: tuple[tuple[int, int], ...], axes: int) -> Tensor:
+    """exp(S), `(..., axes, axes)`, of the symmetric S with `values` `(..., entries)` at `places`."""
+    if len(places) == axes:
+        return torch.diag_embed(values.exp())
+    return torch.linalg.matrix_exp(assemble(values, places, axes))
+
+
+def derivatives(values: Tensor, places: tuple[tuple[int, int], ...], axes: int) -> Tensor:
+    """∂ exp(S) / ∂ S_e for each free entry e, `(..., entries, axes, axes)`.
+
+    The derivative in the direction H is the upper right block of exp [[S, H], [0, S]] (Higham, Functions of Matrices,
+    2008, eq. (3.16)).
+    """
+    s = assemble(values, places, axes).unsqueeze(-3).expand(*values.shape, axes, axes)
+    eye = torch.eye(len(places), dtype=values.dtype)
+    direction = assemble(eye, places, axes).expand_as(s)
+    upper = torch.cat([s, direction], dim=-1)
+    lower = torch.cat([torch.zeros_like(s), s], dim=-1)
+    return torch.linalg.matrix_exp(torch.cat([upper, lower], dim=-2))[..., :axes, axes:]
