@@ -114,6 +114,8 @@ KERNELS = (
     "kernels.warped",
     "kernels.motion_noise",
     "kernels.impedance",
+    "kernels.coupled_terms",
+    "kernels.coupled",
     "kernels",
 )
 ENGINES = (
