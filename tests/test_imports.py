@@ -150,6 +150,8 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             {"priors"},
             set(ENGINES),
             {"training"},
+            {"conditioning"},
+            {"coupled_posterior"},
             {"posterior"},
             {
                 "identifiability",
