@@ -33,7 +33,7 @@ from bayes_impedance.evaluation.contenders import Baseline
 from bayes_impedance.evaluation.cross_validation import as_json as folds_as_json
 from bayes_impedance.evaluation.cross_validation import cross_validate
 from bayes_impedance.evaluation.held_out import as_json, evaluate
-from bayes_impedance.identifiability import summarise
+from bayes_impedance.identifiability import off_diagonals, summarise
 from bayes_impedance.journal import open_journal
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.model import ImpedanceModel
@@ -358,7 +358,7 @@ def show(
     trained = load_model(model)
     posterior = trained.posterior(trained.fitted.log)
     if json_output:
-        shown: dict[str, Any] = dict(summarise(trained.verdicts(posterior)))
+        shown: dict[str, Any] = dict(summarise(trained.verdicts(posterior), off_diagonals(posterior)))
         if sensitivity:
             shown["sensitivity"] = _sensitivity(trained).as_json()
         typer.echo(json.dumps(shown, indent=2))

@@ -229,9 +229,14 @@ def check_combination(config: Config, log: PreparedLog) -> None:
     """Refuse what the model cannot mean on this log.
 
     Raises:
-        ConfigurationError: `equilibrium` with `phase` over several repetitions.
+        ConfigurationError: `equilibrium` with `phase` over several repetitions, or coupled axes with one alone.
     """
     model = config.model
+    if model.axes == "coupled" and len(log.axes) == 1:
+        raise ConfigurationError(
+            f"model.axes: expected a log of two or three axes with coupled, found {log.axes[0]} alone; set "
+            "model.axes=independent, or name more in log.axes"
+        )
     if model.trajectory_input == "phase" and model.desired_trajectory.mean == "equilibrium":
         for group in log.groups:
             count = count_repetitions(

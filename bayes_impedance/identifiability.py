@@ -46,6 +46,42 @@ class Verdict:
         return UNITS[self.latent]
 
 
+@dataclass(frozen=True)
+class OffDiagonal:
+    """An entry of stiffness, damping or mass beside the diagonal, as path averages in SI units, with contraction.
+
+    There is no verdict on it: its sign and size tell of themselves, beside its prior, which is centred at zero.
+    """
+
+    latent: Latent
+    pair: str
+    mean: float
+    q05: float
+    q95: float
+    prior_q05: float
+    prior_q95: float
+    contraction: float
+
+    @property
+    def unit(self) -> str:
+        """SI unit of the estimate."""
+        return UNITS[self.latent]
+
+
+def off_diagonals(posterior: Posterior) -> list[OffDiagonal]:
+    """What couples axes in stiffness, damping and mass, averaged over samples; nothing where axes are independent."""
+    listed = []
+    for latent, marginal in posterior.couplings.items():
+        bands = [marginal.quantile(p) for p in (0.05, 0.95)]
+        bands += [marginal.prior_quantile(p) for p in (0.05, 0.95)]
+        averages = np.stack([marginal.mean, *bands]).mean(axis=1)
+        for k, pair in enumerate(posterior.pairs):
+            mean, low, high, prior_low, prior_high = averages[:, k].tolist()
+            contraction = float(marginal.contraction[k])
+            listed.append(OffDiagonal(latent, pair, mean, low, high, prior_low, prior_high, contraction))
+    return listed
+
+
 def assess(
     posterior: Posterior, config: Config, repetitions: int, perturbed: bool | None = None
 ) -> list[Verdict]:
@@ -181,9 +217,14 @@ def _percentage(contraction: float) -> str:
     return "over 99 %" if contraction > 0.99 else f"{max(contraction, 0.0):.0%}".replace("%", " %")
 
 
-def summarise(verdicts: Iterable[Verdict]) -> dict[str, dict[str, float | str]]:
-    """JSON-able mapping from stiffness_xx, damping_xx, … to estimate, interval, contraction and verdict."""
-    return {
+def summarise(
+    verdicts: Iterable[Verdict], beside: Iterable[OffDiagonal] = ()
+) -> dict[str, dict[str, float | str]]:
+    """JSON-able mapping from stiffness_xx, damping_xx, … to estimate, interval, contraction and verdict.
+
+    Those `beside` the diagonal, stiffness_xy, …, have no verdict.
+    """
+    summary: dict[str, dict[str, float | str]] = {
         f"{v.latent.value}_{v.axis}{v.axis}": {
             "mean": v.mean,
             "q05": v.q05,
@@ -193,3 +234,7 @@ def summarise(verdicts: Iterable[Verdict]) -> dict[str, dict[str, float | str]]:
         }
         for v in verdicts
     }
+    for c in beside:
+        numbers = {"mean": c.mean, "q05": c.q05, "q95": c.q95, "contraction": c.contraction}
+        summary[f"{c.latent.value}_{c.pair}"] = dict(numbers)
+    return summary

@@ -13,7 +13,6 @@ import torch
 
 from bayes_impedance.config import Config, load_config
 from bayes_impedance.device import follow_law
-from bayes_impedance.engines.closed_loop import log_likelihood
 from bayes_impedance.engines.dense import Observations, check_capacity
 from bayes_impedance.engines.pointwise import PointPredictor
 from bayes_impedance.errors import ConfigurationError, LogError
@@ -25,7 +24,7 @@ from bayes_impedance.log import InteractionLog
 from bayes_impedance.posterior import Posterior, compute_posterior
 from bayes_impedance.preprocessing import PreparedLog, prepare
 from bayes_impedance.priors import Entry, ForceModel, build_force_model
-from bayes_impedance.training import Progress, TrainingReport, observations, train
+from bayes_impedance.training import Progress, TrainingReport, log_evidence, observations, train
 from bayes_impedance.trajectory_mean import TrajectoryMean
 
 #: Forces that a posterior conditions on: of the training log, of the log at hand, or of both.
@@ -89,6 +88,11 @@ class ImpedanceModel:
     def report(self) -> TrainingReport:
         """How training went."""
         return self.fitted.report
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """What has a likelihood of its own, in the order of the report: each axis, or "xy" where they are coupled."""
+        return self._parts(self.fitted.log.axes)
 
     @property
     def hyperparameters(self) -> tuple[Entry, ...]:
@@ -189,9 +193,14 @@ class ImpedanceModel:
         Inputs of a sample are rows of `FeatureMap(config, axes)`, the columns that the kernels read.
 
         Raises:
-            ConfigurationError: the model is not fitted, or knows no such axis or group.
+            ConfigurationError: the model is not fitted, knows no such axis or group, or its axes are coupled.
         """
         log = self.fitted.log
+        if self.config.model.axes == "coupled":
+            raise ConfigurationError(
+                "expected model.axes: independent to predict one sample of one axis at a time, got coupled; call "
+                "posterior(log, latents=[Latent.FORCE]), or train with model.axes=independent"
+            )
         if axis not in log.axes or group not in log.groups:
             raise ConfigurationError(
                 f"expected an axis among {', '.join(log.axes)} and a group among {', '.join(log.groups)}, got "
@@ -211,6 +220,8 @@ class ImpedanceModel:
     def log_marginal_likelihood(self, log: InteractionLog | PreparedLog) -> dict[str, float]:
         """log p(force of `log`) at the model's hyperparameters, by axis, summed over groups [nats].
 
+        Coupled axes have one, under their joined names: "xy".
+
         Raises:
             LogError, ConfigurationError, TooManySamplesError, NotPositiveDefiniteError.
         """
@@ -222,10 +233,8 @@ class ImpedanceModel:
             raise LogError("expected a log with force, found none; name log.columns.force")
         model = self._force_model(feature_map)
         with torch.no_grad():
-            value = log_likelihood(
-                model.kernel, observations(model, features), features.loop, self.config.engine.jitter
-            ).sum(-1)
-        return dict(zip(prepared.axes, value.tolist(), strict=True))
+            value = log_evidence(model, features, self.config.engine.jitter)
+        return dict(zip(self._parts(prepared.axes), value.tolist(), strict=True))
 
     def verdicts(self, posterior: Posterior | None = None) -> list[Verdict]:
         """What the data say of stiffness, damping and mass; by default at the training samples.
@@ -246,6 +255,9 @@ class ImpedanceModel:
     def force_model(self, axes: tuple[str, ...]) -> ForceModel:
         """The gpytorch kernel, mean and likelihood underneath, to take into one's own code."""
         return self._force_model(FeatureMap(self.config, axes))
+
+    def _parts(self, axes: tuple[str, ...]) -> tuple[str, ...]:
+        return ("".join(axes),) if self.config.model.axes == "coupled" else axes
 
     def _prepared(self, log: InteractionLog) -> PreparedLog:
         # Phase means the same in every log only if all are aligned to the repetition that the training log was.
@@ -289,6 +301,9 @@ class ImpedanceModel:
         return replace(log, trials=tuple(trials)) if trials else None
 
     def _check_capacity(self, log: PreparedLog) -> None:
+        # Coupled axes stand in one covariance.
+        coupled = len(log.axes) if self.config.model.axes == "coupled" else 1
+        counted = f", each counted once for every of {coupled} coupled axes" if coupled > 1 else ""
         for group in log.groups:
             n = sum(int(trial.observed.sum()) for trial in log.trials if trial.group == group)
-            check_capacity(n, self.config.engine.max_samples, f"group '{group}'")
+            check_capacity(coupled * n, self.config.engine.max_samples, f"group '{group}'{counted}")

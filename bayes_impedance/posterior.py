@@ -6,12 +6,13 @@ predicting u. Warped impedance is conditioned in the logarithm, so its quantiles
 Levels of stiffness, damping and mass that were learned are uncertain too. Their hyperprior enters as a
 Gaussian offset b_j of each process, linearised at the fitted level: u gains Σ_j ē_j sensitivity_j b_j. So
 where ē = 0 (the equilibrium prior) the posterior of an impedance keeps the whole width of its hyperprior.
+Coupled axes: see `coupled_posterior`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -21,13 +22,24 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 from torch import Tensor
 
+from bayes_impedance.conditioning import (
+    Moments,
+    chunks,
+    entry_of,
+    offset_covariance,
+    select_groups,
+    unwarped,
+)
+from bayes_impedance.coupled_posterior import CoupledConditioner, LogTerms
 from bayes_impedance.engines.closed_loop import LoopEvidence
 from bayes_impedance.engines.dense import Factor
 from bayes_impedance.features import Features
+from bayes_impedance.kernels.coupled import CoupledInteractionKernel
+from bayes_impedance.kernels.coupled_terms import pair_names
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, TRAJECTORY_ORDER, InteractionKernel, Latent
 from bayes_impedance.kernels.warped import ImpedanceProcess
 from bayes_impedance.preprocessing import PreparedLog
-from bayes_impedance.priors import Entry, ForceModel
+from bayes_impedance.priors import ForceModel
 from bayes_impedance.training import observations
 
 Array = NDArray[np.float64]
@@ -42,9 +54,6 @@ UNITS: Mapping[Latent, str] = {
     Latent.DAMPING: "Ns/m",
     Latent.MASS: "kg",
 }
-
-#: Targets are taken this many at a time, which bounds memory whatever the length of the log.
-CHUNK = 512
 
 
 @dataclass(frozen=True)
@@ -88,6 +97,12 @@ class Marginal:
         """Prior quantile, `(samples, axes)` [unit of the latent]."""
         return self._quantile(self.prior_location, self.prior_scale, probability)
 
+    def draw(self, draws: int, generator: np.random.Generator, prior: bool = False) -> Array:
+        """Draws of each sample on its own, `(draws, samples, axes)` [unit of the latent]."""
+        location, scale = (self.prior_location, self.prior_scale) if prior else (self.location, self.scale)
+        value = location + scale * generator.standard_normal((draws, *location.shape))
+        return np.exp(value) if self.warped else value
+
     @property
     def contraction(self) -> Array:
         """1 − posterior variance / prior variance of the Gaussian variable, averaged over samples, `(axes,)`."""
@@ -105,11 +120,15 @@ class Marginal:
 class Posterior:
     """Posteriors of the latents at every sample of a log; immutable.
 
-    `marginals[latent]` holds arrays `(samples, axes)`, samples in the order of `log`'s trials.
+    `marginals[latent]` holds arrays `(samples, axes)`, samples in the order of `log`'s trials; of a matrix its
+    diagonal, as a log-normal of the same mean and variance. Where axes are coupled `couplings[latent]` holds the
+    entries beside the diagonal, `(samples, pairs)`, as Gaussians, and `terms[latent]` what the matrix is made of.
     """
 
     log: PreparedLog
     marginals: Mapping[Latent, Marginal]
+    couplings: Mapping[Latent, Marginal] = field(default_factory=dict)
+    terms: Mapping[Latent, LogTerms] = field(default_factory=dict)
 
     def __getitem__(self, latent: Latent | str) -> Marginal:
         """Marginal of a latent, by member of `Latent` or by name ("stiffness")."""
@@ -119,6 +138,11 @@ class Posterior:
     def axes(self) -> tuple[str, ...]:
         """Axes of the log."""
         return self.log.axes
+
+    @property
+    def pairs(self) -> tuple[str, ...]:
+        """Pairs of axes that couple, in the order of `couplings`: xy, xz, yz; none where axes are independent."""
+        return pair_names(self.axes) if self.couplings else ()
 
     def trial_slice(self, index: int) -> slice:
         """Rows of trial `index` in the arrays of the marginals."""
@@ -140,14 +164,48 @@ class Posterior:
         columns["trial"] = np.repeat([trial.name for trial in trials], lengths)
         columns["time"] = np.concatenate([trial.time for trial in trials])
         for latent, marginal in self.marginals.items():
-            low, high = marginal.quantile(0.05), marginal.quantile(0.95)
-            for a, axis in enumerate(self.axes):
-                name = f"{latent.value}_{axis}{axis if latent in IMPEDANCE_ORDER else ''}"
-                columns[f"{name}_mean"] = marginal.mean[:, a]
-                columns[f"{name}_sd"] = marginal.sd[:, a]
-                columns[f"{name}_q05"] = low[:, a]
-                columns[f"{name}_q95"] = high[:, a]
+            doubled = [f"{axis}{axis}" if latent in IMPEDANCE_ORDER else axis for axis in self.axes]
+            columns |= _columns(marginal, doubled)
+            if latent in self.couplings:
+                columns |= _columns(self.couplings[latent], self.pairs)
         return pd.DataFrame(columns)
+
+
+def _columns(marginal: Marginal, names: Sequence[str]) -> dict[str, object]:
+    columns: dict[str, object] = {}
+    low, high = marginal.quantile(0.05), marginal.quantile(0.95)
+    for a, name in enumerate(names):
+        columns[f"{marginal.latent.value}_{name}_mean"] = marginal.mean[:, a]
+        columns[f"{marginal.latent.value}_{name}_sd"] = marginal.sd[:, a]
+        columns[f"{marginal.latent.value}_{name}_q05"] = low[:, a]
+        columns[f"{marginal.latent.value}_{name}_q95"] = high[:, a]
+    return columns
+
+
+def draw_matrices(posterior: Posterior, draws: int, seed: int, prior: bool = False) -> Array:
+    """Draws of K [N/m], D [Ns/m] and M [kg] at each sample, `(draws, samples, 3, axes, axes)`, or of their prior.
+
+    Samples, and K, D and M, are drawn each on its own: what a draw shows is one instant, not a course along the path.
+    Diagonal where axes are independent.
+
+    Example:
+        >>> from bayes_impedance.simulation.generative import repeated_motion
+        >>> motion = repeated_motion(repetitions=1, duration=1.0, rate=2.0)
+        >>> level = np.full((2, 2), np.log(300.0))
+        >>> k = Marginal(Latent.STIFFNESS, True, level, 0.1 + 0 * level, level, 0.1 + 0 * level)
+        >>> posterior = Posterior(motion, {Latent.STIFFNESS: k, Latent.DAMPING: k, Latent.MASS: k})
+        >>> draw_matrices(posterior, 5, seed=0).shape
+        (5, 2, 3, 2, 2)
+    """
+    generator = np.random.default_rng(seed)
+    drawn = []
+    for latent in IMPEDANCE_ORDER:
+        if latent in posterior.terms:
+            drawn.append(posterior.terms[latent].draw(draws, generator, prior))
+        else:
+            diagonal = posterior[latent].draw(draws, generator, prior)
+            drawn.append(diagonal[..., None] * np.eye(diagonal.shape[-1]))
+    return np.stack(drawn, axis=2)
 
 
 def compute_posterior(
@@ -166,22 +224,63 @@ def compute_posterior(
         NotPositiveDefiniteError: the covariance of the given forces does not factorise.
     """
     if latents is None:
-        latents = list(Latent) if isinstance(model.kernel, InteractionKernel) else [Latent.FORCE]
+        has_impedance = isinstance(model.kernel, (InteractionKernel, CoupledInteractionKernel))
+        latents = list(Latent) if has_impedance else [Latent.FORCE]
     known = [] if given is None else [g for g in target.groups if g in given.groups]
     unknown = [g for g in target.groups if g not in known]
+    if model.is_coupled:
+        return _coupled_posterior(model, log, target, given, jitter, latents, (known, unknown))
     parts: list[tuple[list[str], dict[Latent, Moments]]] = []
     with torch.no_grad():
         if known:
             assert given is not None
-            conditioner = _Conditioner(model, _select_groups(given, known), jitter)
-            parts.append((known, conditioner.moments(_select_groups(target, known), latents)))
+            conditioner = _Conditioner(model, select_groups(given, known), jitter)
+            parts.append((known, conditioner.moments(select_groups(target, known), latents)))
         if unknown:
-            parts.append((unknown, _prior_only(model, _select_groups(target, unknown), latents)))
+            parts.append((unknown, _prior_only(model, select_groups(target, unknown), latents)))
     return Posterior(log, {latent: _marginal(model, log, target, latent, parts) for latent in latents})
 
 
-#: Location, variance, prior location, prior variance, each `(axes, groups, m)`.
-Moments = tuple[Tensor, Tensor, Tensor, Tensor]
+def _coupled_posterior(
+    model: ForceModel, log: PreparedLog, target: Features, given: Features | None, jitter: float,
+    latents: Sequence[Latent], groups: tuple[list[str], list[str]],
+) -> Posterior:  # fmt: skip
+    parts, terms = [], []
+    with torch.no_grad():
+        for chosen, condition in zip(groups, (given, None), strict=True):
+            if not chosen:
+                continue
+            evidence = None if condition is None else select_groups(condition, chosen)
+            conditioner = CoupledConditioner(model, evidence, jitter)
+            wanted = select_groups(target, chosen)
+            parts.append((chosen, conditioner.moments(wanted, latents)))
+            terms.append((chosen, conditioner.terms(wanted, latents)))
+    marginals, couplings, matrices = {}, {}, {}
+    for latent in latents:
+        if latent not in IMPEDANCE_ORDER:
+            marginals[latent] = _marginal(model, log, target, latent, parts)
+            continue
+        listed = [
+            _by_sample(log, target, [(chosen, found[latent][i]) for chosen, found in terms]) for i in range(4)
+        ]
+        matrices[latent] = LogTerms(len(log.axes), *listed)
+        marginals[latent], couplings[latent] = matrix_marginals(latent, matrices[latent])
+    return Posterior(log, marginals, couplings, matrices)
+
+
+def matrix_marginals(latent: Latent, terms: LogTerms) -> tuple[Marginal, Marginal]:
+    """Entries of a matrix with the mean and variance that its terms give: diagonal log-normal, `(samples, axes)`, and
+    the others Gaussian, `(samples, pairs)`.
+    """
+    diagonal, other = [], []
+    rows, columns = np.triu_indices(terms.axes, 1)
+    for prior in (False, True):
+        mean, variance = terms.moments(prior)
+        centre, spread = (part.diagonal(axis1=1, axis2=2) for part in (mean, variance))
+        log_variance = np.log1p(spread / centre**2)
+        diagonal += [np.log(centre) - 0.5 * log_variance, np.sqrt(log_variance)]
+        other += [mean[:, rows, columns], np.sqrt(variance[:, rows, columns])]
+    return Marginal(latent, True, *diagonal), Marginal(latent, False, *other)
 
 
 class _Conditioner:
@@ -195,12 +294,7 @@ class _Conditioner:
         self.has_levels = variance is not None
         if variance is not None:
             self.white_loading = self.factor.whiten(_level_loading(model, given.inputs, Latent.FORCE))
-            gram = self.white_loading.mT @ self.white_loading
-            root = variance.sqrt()
-            scaled = root.unsqueeze(-1) * gram * root.unsqueeze(-2)
-            # Covariance of b given the forces, V½ (I + V½ AᵀK⁻¹A V½)⁻¹ V½, defined for V = 0 too.
-            inner = torch.linalg.inv(torch.eye(gram.shape[-1], dtype=gram.dtype) + scaled)
-            self.level_covariance = root.unsqueeze(-1) * inner * root.unsqueeze(-2)
+            self.level_covariance = offset_covariance(self.white_loading, variance)
         self.loop = None
         if given.loop is not None:
             self.loop = LoopEvidence(model.kernel.impedance, self.factor, forces, given.loop)
@@ -212,7 +306,7 @@ class _Conditioner:
     def moments(self, target: Features, latents: Sequence[Latent]) -> dict[Latent, Moments]:
         result = {}
         for latent in latents:
-            pieces = [self._chunk(piece, latent) for piece in _chunks(target)]
+            pieces = [self._chunk(piece, latent) for piece in chunks(target)]
             a, b, c, d = zip(*pieces, strict=True)
             result[latent] = tuple(torch.cat(part, dim=-1) for part in (a, b, c, d))
         return result  # type: ignore[return-value]
@@ -235,21 +329,10 @@ class _Conditioner:
             with_loop = with_loop + (loading @ self.loop_loading).squeeze(-1)
             variance = (variance - with_loop.square() * self.loop_gain).clamp_min(0.0)
         if _is_warped(self.model, latent):
-            location = _unwarped(location, prior.location, known, prior.own_variance)
+            location = unwarped(location, prior.location, known, prior.own_variance)
         if latent is Latent.FORCE:
             variance = variance + self.model.noise_variance
         return location, variance, prior.shown.expand_as(location), prior.variance.expand_as(location)
-
-
-def _unwarped(location: Tensor, prior_location: Tensor, variance: Tensor, prior_variance: Tensor) -> Tensor:
-    """Location of log w to second order: that of the log-normal whose moments are those of w given the forces.
-
-    To first order E[w|u] = E[w] (1 + a) with the shift a of log w, and E[w] = exp(location + ½ prior variance). The
-    logarithm of 1 + a is replaced by its expansion below zero, where a linear estimate of w may become negative.
-    """
-    a = location - prior_location
-    log = torch.where(a > 0.0, torch.log1p(a.clamp_min(0.0)), a - 0.5 * a.square())
-    return prior_location + 0.5 * (prior_variance - variance) + log
 
 
 def _is_warped(model: ForceModel, latent: Latent) -> bool:
@@ -311,14 +394,10 @@ def _prior(model: ForceModel, target: Features, latent: Latent) -> _Prior:
         location = target.trajectory_mean[..., TRAJECTORY_ORDER[latent]]
         return _Prior(location, location, own, variance, loading)
     process = model.kernel.impedance.processes[IMPEDANCE_ORDER[latent]]
-    level, median = process.level[..., 0], _level_entry(model, latent).medians
+    level, median = process.level[..., 0], entry_of(model, f"{latent.value}.level").medians
     if process.law == "log_gaussian":
         level, median = level.log(), median.log()
     return _Prior(level, median, own, variance, loading)
-
-
-def _level_entry(model: ForceModel, latent: Latent) -> Entry:
-    return next(entry for entry in model.entries if entry.name == f"{latent.value}.level")
 
 
 def _level_variance(model: ForceModel) -> Tensor | None:
@@ -328,7 +407,7 @@ def _level_variance(model: ForceModel) -> Tensor | None:
     variances = []
     for latent, order in IMPEDANCE_ORDER.items():
         process = model.kernel.impedance.processes[order]
-        spec = _level_entry(model, latent).specs[0]
+        spec = entry_of(model, f"{latent.value}.level").specs[0]
         log_sd = 0.0 if spec.fixed else spec.log_sd
         level = process.level[..., 0]
         scale = level if process.law == "gaussian" else torch.ones_like(level)
@@ -356,42 +435,19 @@ def _marginal(
     parts: Sequence[tuple[list[str], dict[Latent, Moments]]],
 ) -> Marginal:  # fmt: skip
     """Undo the batching: rows of groups back to samples of trials."""
-    starts = np.cumsum([0, *(len(trial.time) for trial in log.trials)])
-    arrays = np.empty((4, starts[-1], len(log.axes)))
-    for groups, moments in parts:
-        stacked = torch.stack(moments[latent]).numpy()
-        for g, group in enumerate(groups):
-            rows = target.rows[target.groups.index(group)]
-            arrays[:, starts[rows[:, 0]] + rows[:, 1]] = np.moveaxis(stacked[:, :, g, : len(rows)], 1, 2)
-    location, variance, prior_location, prior_variance = arrays
+    # `(groups, m, axes, 4)`
+    batches = [(groups, torch.stack(moments[latent]).permute(2, 3, 1, 0)) for groups, moments in parts]
+    location, variance, prior_location, prior_variance = np.moveaxis(_by_sample(log, target, batches), -1, 0)
     warped = _is_warped(model, latent)
     return Marginal(latent, warped, location, np.sqrt(variance), prior_location, np.sqrt(prior_variance))
 
 
-def _select_groups(features: Features, groups: Sequence[str]) -> Features:
-    index = [features.groups.index(group) for group in groups]
-    return replace(
-        features,
-        groups=tuple(groups),
-        inputs=features.inputs[:, index],
-        force=None if features.force is None else features.force[:, index],
-        trajectory_mean=features.trajectory_mean[:, index],
-        valid=None if features.valid is None else features.valid[index],
-        rows=tuple(features.rows[i] for i in index),
-        loop=None if features.loop is None else features.loop.select(index),
-    )
-
-
-def _chunks(features: Features) -> list[Features]:
-    starts = range(0, features.inputs.shape[2], CHUNK)
-    pieces = [slice(start, start + CHUNK) for start in starts]
-    return [
-        replace(
-            features,
-            inputs=features.inputs[:, :, piece],
-            force=None,
-            trajectory_mean=features.trajectory_mean[:, :, piece],
-            valid=None,
-        )
-        for piece in pieces
-    ]
+def _by_sample(log: PreparedLog, target: Features, batches: Sequence[tuple[list[str], Tensor]]) -> Array:
+    """Values `(groups, m, …)` of batches of groups as `(samples, …)`, in the order of the log's trials."""
+    starts = np.cumsum([0, *(len(trial.time) for trial in log.trials)])
+    values = np.empty((starts[-1], *batches[0][1].shape[2:]))
+    for groups, batch in batches:
+        for g, group in enumerate(groups):
+            rows = target.rows[target.groups.index(group)]
+            values[starts[rows[:, 0]] + rows[:, 1]] = batch[g, : len(rows)].numpy()
+    return values

@@ -7,7 +7,7 @@ the hyperprior alone puts the mode at the stated median whatever its width.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gpytorch
@@ -23,6 +23,13 @@ from bayes_impedance.config.model import LARGEST_LOG_SD
 from bayes_impedance.config.sections import Component
 from bayes_impedance.errors import ConfigurationError
 from bayes_impedance.features import UNITS, FeatureMap, baseline_components, theta_components
+from bayes_impedance.kernels.coupled import (
+    CoupledImpedanceKernel,
+    CoupledInteractionKernel,
+    by_axis,
+    join_axes,
+)
+from bayes_impedance.kernels.coupled_terms import CoupledProcess, pair_names
 from bayes_impedance.kernels.impedance import ImpedanceKernel, InputLayout, InteractionKernel
 from bayes_impedance.kernels.motion_noise import MotionNoiseKernel
 from bayes_impedance.kernels.stationary import StationaryKernel, log_positive
@@ -53,7 +60,8 @@ class Entry:
     """One hyperparameter of a force model: where it lives, its units and hyperprior.
 
     `specs[c]` is the hyperprior of component c of the last dimension, `labels[c]` its name, `units[c]` its unit;
-    `power` maps the module's value to the one that users see (σ_r from a variance).
+    `power` maps the module's value to the one that users see (σ_r from a variance). `members` names what the first
+    dimension counts; empty where it is the axes.
     """
 
     name: str
@@ -63,10 +71,11 @@ class Entry:
     constraint: Interval
     units: tuple[str, ...]
     power: float = 1.0
+    members: tuple[str, ...] = ()
 
     @property
     def value(self) -> Tensor:
-        """Value in the unit users see, `(axes, 1, 1, components)`."""
+        """Value in the unit users see, `(axes, 1, 1, components)`, or `(members, 1, 1, components)`."""
         shape = (*self.raw.shape[:1], 1, 1, len(self.specs))
         return self.constraint.transform(self.raw).reshape(shape) ** self.power
 
@@ -99,7 +108,8 @@ class Entry:
 class ForceModel(gpytorch.Module):
     """Kernel, prior mean and noise of the force, with its hyperparameters listed.
 
-    Batch shape of every hyperparameter is `(axes, 1)`: one value an axis, shared by groups.
+    Batch shape of every hyperparameter is `(axes, 1)`: one value an axis, shared by groups. Where axes are coupled that
+    of couplings is `(2 pairs, 1)`, one for each sign of each pair, and there is one density of all forces together.
     """
 
     def __init__(
@@ -140,8 +150,16 @@ class ForceModel(gpytorch.Module):
             with torch.no_grad():
                 entry.raw.copy_(torch.where(entry.free, other.raw, entry.raw))
 
+    @property
+    def is_coupled(self) -> bool:
+        """Whether one density is of the forces along all axes together."""
+        return isinstance(self.kernel, CoupledInteractionKernel)
+
     def prior_mean(self, inputs: Tensor) -> Tensor:
         """E[u], `(axes, groups, n)` [N]."""
+        if isinstance(self.kernel, CoupledInteractionKernel):
+            joined = join_axes(inputs, self.kernel.impedance.layout)
+            return by_axis(self.kernel.prior_mean(joined), inputs.shape[0])
         if isinstance(self.kernel, InteractionKernel):
             return self.kernel.prior_mean(inputs)
         return inputs.new_zeros(inputs.shape[:-1])
@@ -152,11 +170,11 @@ class ForceModel(gpytorch.Module):
         return self.likelihood.noise
 
     def log_prior(self) -> Tensor:
-        """Log density of the hyperpriors, `(axes,)` [nats]."""
+        """Log density of the hyperpriors, `(axes,)`, or `(1,)` where axes are coupled [nats]."""
         total = torch.zeros((), dtype=torch.float64)
         for _, module, prior, closure, _ in self.named_priors():
             density = prior.log_prob(closure(module))
-            total = total + density.reshape(density.shape[0], -1).sum(-1)
+            total = total + density.reshape(1 if self.is_coupled else density.shape[0], -1).sum(-1)
         return total
 
 
@@ -174,9 +192,12 @@ def build_force_model(config: Config, features: FeatureMap) -> ForceModel:
         active_dims=None,
         shape=model.desired_trajectory.shape,
     )
-    stiffness = _impedance(model.stiffness, features, batch)
-    damping = _impedance(model.damping, features, batch)
-    mass = _impedance(model.mass, features, batch)
+    # Functions have matrices of their own: there these are the processes of the entries of a logarithm.
+    coupled = model.axes == "coupled" and config.engine.impedance == "moments"
+    impedance_of = _coupled_impedance if coupled else _impedance
+    stiffness = impedance_of(model.stiffness, features, batch)
+    damping = impedance_of(model.damping, features, batch)
+    mass = impedance_of(model.mass, features, batch)
     residual = None
     if model.residual is not None:
         dims = features.active_dims(model.residual.input)
@@ -190,24 +211,33 @@ def build_force_model(config: Config, features: FeatureMap) -> ForceModel:
             )
             residual = AdditiveKernel(residual, offset)
     layout: InputLayout = features.layout
-    impedance = ImpedanceKernel(layout, trajectory, stiffness, damping, mass)
     motion_noise = None
     if layout.smoothing:
         assert model.position_noise_sd is not None
+        processes = () if coupled else (stiffness, damping, mass)
         motion_noise = MotionNoiseKernel(
-            layout.smoothing, impedance.processes, motion_weights, _prior(model.position_noise_sd), batch
+            layout.smoothing, processes, motion_weights, _prior(model.position_noise_sd), batch
         )
-    kernel = InteractionKernel(impedance, residual, motion_noise=motion_noise)
+    kernel: Kernel
+    if coupled:
+        joint = CoupledImpedanceKernel(layout, features.width, trajectory, stiffness, damping, mass)
+        kernel = CoupledInteractionKernel(joint, residual, motion_noise)
+    else:
+        impedance = ImpedanceKernel(layout, trajectory, stiffness, damping, mass)
+        kernel = InteractionKernel(impedance, residual, motion_noise=motion_noise)
 
     def entries(force_model: ForceModel) -> list[Entry]:
         impedance = force_model.kernel.impedance
         listed = [
             _entry("stiffness.level", "N/m", impedance.stiffness, "level", model.stiffness.level),
             *_process_entries("stiffness", "N/m", impedance.stiffness, model.stiffness, features),
+            *_coupling_entries("stiffness", impedance.stiffness, model.stiffness.coupling, features),
             _entry("damping.level", "Ns/m", impedance.damping, "level", model.damping.level),
             *_process_entries("damping", "Ns/m", impedance.damping, model.damping, features),
+            *_coupling_entries("damping", impedance.damping, model.damping.coupling, features),
             _entry("mass.level", "kg", impedance.mass, "level", model.mass.level),
             *_process_entries("mass", "kg", impedance.mass, model.mass, features),
+            *_coupling_entries("mass", impedance.mass, model.mass.coupling, features),
             _entry("desired_trajectory.sd", "m", impedance.trajectory, "sd", model.desired_trajectory.sd),
             _length_scales(
                 "desired_trajectory", impedance.trajectory, model.desired_trajectory.length_scale,
@@ -275,9 +305,27 @@ def _is_log(prior: ImpedancePrior | MassPrior) -> bool:
 def _impedance(
     prior: ImpedancePrior | MassPrior, features: FeatureMap, batch: torch.Size
 ) -> ImpedanceProcess:
+    law: Law = "log_gaussian" if _is_log(prior) else "gaussian"
+    covariance = _impedance_covariance(prior, features, batch)
+    return ImpedanceProcess(covariance, law, level_prior=_prior(prior.level), batch_shape=batch)
+
+
+def _coupled_impedance(
+    prior: ImpedancePrior | MassPrior, features: FeatureMap, batch: torch.Size
+) -> CoupledProcess:
+    covariance = _impedance_covariance(prior, features, batch)
+    relative = isinstance(prior, MassPrior) and not prior.input
+    return CoupledProcess(
+        covariance, batch[0], _prior(prior.level), _prior(prior.coupling), relative=relative
+    )
+
+
+def _impedance_covariance(
+    prior: ImpedancePrior | MassPrior, features: FeatureMap, batch: torch.Size
+) -> StationaryKernel:
     specs = _length_scale_specs(prior.length_scale, prior.input, features)
     learned_log_sd = _is_log(prior) and not prior.scale.fixed
-    covariance = StationaryKernel(
+    return StationaryKernel(
         num_dims=len(specs),
         batch_shape=batch,
         active_dims=features.active_dims(prior.input) if specs else None,
@@ -286,8 +334,6 @@ def _impedance(
         sd_constraint=Interval(0.0, LARGEST_LOG_SD) if learned_log_sd else None,
         lengthscale_prior=_prior(*specs) if specs else None,
     )
-    law: Law = "log_gaussian" if _is_log(prior) else "gaussian"
-    return ImpedanceProcess(covariance, law, level_prior=_prior(prior.level), batch_shape=batch)
 
 
 def _likelihood(config: Config, batch: torch.Size) -> GaussianLikelihood:
@@ -341,6 +387,15 @@ def _process_entries(
     if prior.input:
         entries.append(_length_scales(name, process.covariance, prior.length_scale, prior.input, features))
     return entries
+
+
+def _coupling_entries(
+    name: str, process: ImpedanceProcess | CoupledProcess, spec: Hyperparameter, features: FeatureMap
+) -> list[Entry]:
+    if not isinstance(process, CoupledProcess):
+        return []
+    signs = tuple(f"{pair} {sign}" for pair in pair_names(features.axes) for sign in ("+", "−"))
+    return [replace(_entry(f"{name}.coupling", "1", process, "coupling", spec), members=signs)]
 
 
 def _residual_entries(

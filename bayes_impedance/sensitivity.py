@@ -102,7 +102,10 @@ class Effect:
 
 @dataclass(frozen=True)
 class Refit:
-    """One change and what followed: effects and the change of log p(u) by axis [nats], or why there are none."""
+    """One change and what followed: effects and the change of log p(u) by axis [nats], or why there are none.
+
+    Coupled axes have one log p(u). Effects are on diagonals.
+    """
 
     change: Change
     effects: tuple[Effect, ...]
@@ -248,7 +251,7 @@ def _compare(base: _Conclusions, change: Change) -> Refit:
     except NotPositiveDefiniteError as error:
         return Refit(change, (), {}, converged=False, failure=str(error))
     before, after = base.model.report, changed.model.report
-    likelihoods = zip(base.posterior.axes, before.log_likelihood, after.log_likelihood, strict=True)
+    likelihoods = zip(base.model.parts, before.log_likelihood, after.log_likelihood, strict=True)
     return Refit(
         change,
         _effects(base, changed),

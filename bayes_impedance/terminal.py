@@ -14,7 +14,7 @@ from rich.table import Table
 
 from bayes_impedance.config import TrainingConfig
 from bayes_impedance.evaluation.held_out import Evaluation
-from bayes_impedance.identifiability import Support, Verdict, caveat, rounded
+from bayes_impedance.identifiability import OffDiagonal, Support, Verdict, caveat, off_diagonals, rounded
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.posterior import Posterior
@@ -80,8 +80,8 @@ def simulation_progress(console: Console, trials: int) -> Iterator[Callable[[int
         yield lambda done: bar.update(task, completed=done)
 
 
-def verdict_table(verdicts: Sequence[Verdict]) -> Table:
-    """Path averages of stiffness, damping and mass, each beside its verdict."""
+def verdict_table(verdicts: Sequence[Verdict], beside: Sequence[OffDiagonal] = ()) -> Table:
+    """Path averages of stiffness, damping and mass, each beside its verdict; then what couples axes, without one."""
     table = Table(title="Impedance, averaged over the samples", title_justify="left")
     table.add_column("")
     for name in ("mean", "90 % interval", "prior 90 %", "contraction"):
@@ -89,12 +89,19 @@ def verdict_table(verdicts: Sequence[Verdict]) -> Table:
     table.add_column("verdict")
     for v in verdicts:
         colour = COLOURS[v.support]
-        table.add_row(
-            f"{v.latent.value} {v.axis}{v.axis} [{v.unit}]".replace("[", "\\["), f"{v.mean:.4g}",
-            f"{v.q05:.4g} … {v.q95:.4g}", f"{v.prior_q05:.3g} … {v.prior_q95:.3g}", rounded(v.contraction),
-            f"[{colour}]{_short(v.support)}[/{colour}]",
-        )  # fmt: skip
+        table.add_row(*_estimate_cells(v, 2 * v.axis), f"[{colour}]{_short(v.support)}[/{colour}]")
+    table.add_section()
+    for c in beside:
+        table.add_row(*_estimate_cells(c, c.pair), "")
     return table
+
+
+def _estimate_cells(e: Verdict | OffDiagonal, entry: str) -> list[str]:
+    """Name, mean, interval, prior interval and contraction of an entry of K, D or M."""
+    return [
+        f"{e.latent.value} {entry} [{e.unit}]".replace("[", "\\["), f"{e.mean:.4g}",
+        f"{e.q05:.4g} … {e.q95:.4g}", f"{e.prior_q05:.3g} … {e.prior_q95:.3g}", rounded(e.contraction),
+    ]  # fmt: skip
 
 
 def planning_table(plan: Plan, latent: Latent = Latent.STIFFNESS) -> Table:
@@ -122,7 +129,7 @@ def _short(support: Support) -> str:
 def print_verdicts(console: Console, model: ImpedanceModel, posterior: Posterior) -> list[Verdict]:
     """The table, then the sentences, then what they all presuppose."""
     verdicts = model.verdicts(posterior)
-    console.print(verdict_table(verdicts))
+    console.print(verdict_table(verdicts, off_diagonals(posterior)))
     # Parameters of which the same is to be said share a line.
     said: dict[str, list[str]] = {}
     for verdict in verdicts:
@@ -144,7 +151,7 @@ def hyperparameter_table(model: ImpedanceModel) -> Table:
         table.add_column(name, justify="left" if name in ("", "axis", "unit") else "right")
     for entry in model.hyperparameters:
         for c, label in enumerate(entry.labels):
-            for a, axis in enumerate(axes):
+            for a, axis in enumerate(entry.members or axes):
                 table.add_row(*_hyperparameter_row(entry, c, label, a, axis, model))
         table.add_section()
     return table
@@ -185,9 +192,7 @@ def restart_table(model: ImpedanceModel) -> Table:
     ):
         table.add_column(name, justify="left" if name == "outcome" else "right")
     for r in report.restarts:
-        best = [
-            axis for axis, index in zip(model.fitted.log.axes, report.best, strict=True) if index == r.restart
-        ]
+        best = [part for part, index in zip(model.parts, report.best, strict=True) if index == r.restart]
         outcome = r.outcome.lower() + (f"; best for {', '.join(best)}" if best else "")
         table.add_row(
             str(r.restart), _values(r.objective), _values(r.log_likelihood), str(r.iterations),

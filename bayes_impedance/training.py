@@ -1,7 +1,8 @@
 """Hyperparameters from the marginal likelihood: MAP by L-BFGS with restarts, and its Laplace approximation.
 
 Axes have their own hyperparameters and share none, so one objective is optimised for all of them
-together (each evaluation is batched over axes and groups) and the best restart is chosen an axis at a time.
+together (each evaluation is batched over axes and groups) and the best restart is chosen an axis at a time. Where axes
+are coupled they have one objective, and one best restart. A part is what has an objective of its own: an axis, or all.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from bayes_impedance.engines.dense import Observations
 from bayes_impedance.errors import NotPositiveDefiniteError
 from bayes_impedance.features import Features
 from bayes_impedance.journal import Journal
+from bayes_impedance.kernels.coupled import join_axes, rows_of
 from bayes_impedance.priors import Entry, ForceModel
 
 Array = NDArray[np.float64]
@@ -39,7 +41,7 @@ NOTHING_FREE = "every hyperparameter is fixed"
 
 @dataclass(frozen=True)
 class RestartReport:
-    """How one restart ended; `objective` log posterior density and `log_likelihood`, one an axis [nats]."""
+    """How one restart ended; `objective` log posterior density and `log_likelihood`, one a part [nats]."""
 
     restart: int
     objective: tuple[float, ...]
@@ -59,8 +61,9 @@ class RestartReport:
 class TrainingReport:
     """Result of training.
 
-    `best[a]` is the restart that axis a took; `log_sd[name]` `(axes, components)` is the Laplace SD of the
-    logarithm of each hyperparameter, NaN where it is fixed; `interrupted` where the user stopped it.
+    `best[a]` is the restart that part a took; `log_sd[name]` `(axes, components)` is the Laplace SD of the
+    logarithm of each hyperparameter, NaN where it is fixed; `interrupted` where the user stopped it. Parts are the
+    axes, or one for all of them where they are coupled.
     """
 
     restarts: tuple[RestartReport, ...]
@@ -72,20 +75,36 @@ class TrainingReport:
     samples: int
 
 
-#: Called as progress(restart, iteration, objective summed over axes).
+#: Called as progress(restart, iteration, objective summed over parts).
 Progress = Callable[[int, int, float], None]
 
 
 def observations(model: ForceModel, features: Features) -> Observations:
-    """Force less its prior mean, with noise, of a log that has force."""
+    """Force less its prior mean, with noise, of a log that has force; where axes are coupled all of them in one row."""
     assert features.force is not None
     residual = features.force - model.prior_mean(features.inputs)
-    return Observations(features.inputs, residual, model.noise_variance, features.valid)
+    if not model.is_coupled:
+        return Observations(features.inputs, residual, model.noise_variance, features.valid)
+    inputs = join_axes(features.inputs, model.kernel.impedance.layout)
+    axes, n = residual.shape[0], residual.shape[-1]
+    valid = None if features.valid is None else features.valid.repeat_interleave(axes, dim=-1)
+    return Observations(inputs, rows_of(residual), model.noise_variance.reshape(axes).repeat(n), valid)
+
+
+def log_evidence(model: ForceModel, features: Features, jitter: float) -> Tensor:
+    """log p(u) summed over groups, `(axes,)`, or `(1,)` where axes are coupled [nats].
+
+    Raises:
+        NotPositiveDefiniteError: no Cholesky factor at this jitter.
+    """
+    return (
+        log_likelihood(model.kernel, observations(model, features), features.loop, jitter).sum(-1).reshape(-1)
+    )
 
 
 def objective(model: ForceModel, features: Features, jitter: float) -> tuple[Tensor, Tensor]:
-    """Log posterior density of the hyperparameters and log marginal likelihood, `(axes,)` each [nats]."""
-    likelihood = log_likelihood(model.kernel, observations(model, features), features.loop, jitter).sum(-1)
+    """Log posterior density of the hyperparameters and log marginal likelihood, `(parts,)` each [nats]."""
+    likelihood = log_evidence(model, features, jitter)
     return likelihood + model.log_prior(), likelihood
 
 
@@ -171,46 +190,50 @@ def _climb(search: _Search, start: Array, config: TrainingConfig) -> str:
 
 
 class _Search:
-    """The objective as scipy sees it: a function of one vector, the free unconstrained values by axis."""
+    """The objective as scipy sees it: a function of one vector, the free unconstrained values by part."""
 
     def __init__(self, model: ForceModel, features: Features, jitter: float, journal: Journal | None) -> None:
         self.model, self.features, self.jitter, self.journal = model, features, jitter, journal
         self.entries: list[Entry] = [entry for entry in model.entries if bool(entry.free.any())]
-        self.axes = features.inputs.shape[0]
-        free = [entry.free.numpy() for entry in self.entries]
+        self.parts = 1 if model.is_coupled else features.inputs.shape[0]
+        free = [np.tile(entry.free.numpy(), self._members(entry)) for entry in self.entries]
         self.free = np.concatenate(free) if free else np.zeros(0, dtype=bool)
         self.bounds = self._bounds()
-        self.best_objective = np.full(self.axes, -np.inf)
-        self.best_likelihood = np.full(self.axes, -np.inf)
-        self.best_restart = np.zeros(self.axes, dtype=int)
+        self.best_objective = np.full(self.parts, -np.inf)
+        self.best_likelihood = np.full(self.parts, -np.inf)
+        self.best_restart = np.zeros(self.parts, dtype=int)
         self.best_point = self.pack()
         self.begin(0, None)
 
     def begin(self, restart: int, progress: Progress | None) -> None:
         self.restart, self.progress = restart, progress
         self.iterations = self.evaluations = 0
-        self.reached = np.full(self.axes, -np.inf)
-        self.reached_likelihood = np.full(self.axes, -np.inf)
+        self.reached = np.full(self.parts, -np.inf)
+        self.reached_likelihood = np.full(self.parts, -np.inf)
+
+    def _members(self, entry: Entry) -> int:
+        """Values of each component of a hyperparameter that belong to one part."""
+        return int(entry.raw.shape[0]) // self.parts
 
     def pack(self) -> Array:
-        """Free unconstrained values, `(axes, free)`."""
+        """Free unconstrained values, `(parts, free)`."""
         if not self.entries:
-            return np.zeros((self.axes, 0))
-        raw = [entry.raw.detach().reshape(self.axes, -1).numpy() for entry in self.entries]
+            return np.zeros((self.parts, 0))
+        raw = [entry.raw.detach().reshape(self.parts, -1).numpy() for entry in self.entries]
         return np.concatenate(raw, axis=1)[:, self.free].copy()
 
     def unpack(self, point: Array) -> None:
-        """Write `(axes, free)` values into the model."""
+        """Write `(parts, free)` values into the model."""
         if not self.entries:
             return
         full = np.concatenate(
-            [entry.raw.detach().reshape(self.axes, -1).numpy() for entry in self.entries], axis=1
+            [entry.raw.detach().reshape(self.parts, -1).numpy() for entry in self.entries], axis=1
         ).copy()
-        full[:, self.free] = point.reshape(self.axes, -1)
+        full[:, self.free] = point.reshape(self.parts, -1)
         column = 0
         with torch.no_grad():
             for entry in self.entries:
-                width = len(entry.specs)
+                width = entry.raw.numel() // self.parts
                 entry.raw.copy_(torch.from_numpy(full[:, column : column + width]).reshape(entry.raw.shape))
                 column += width
 
@@ -218,12 +241,12 @@ class _Search:
         """Hyperprior medians, or a draw from the hyperprior, inside the bounds."""
         columns = []
         for entry in self.entries:
-            deviation = np.zeros((self.axes, len(entry.specs)))
+            deviation = np.zeros((entry.raw.shape[0], len(entry.specs)))
             if generator is not None:
                 deviation = generator.standard_normal(deviation.shape)
             values = entry.medians * torch.exp(entry.log_sds * torch.from_numpy(deviation))
             raw = torch.stack([entry.inverse(row)[0].reshape(-1) for row in values])
-            columns.append(raw.numpy())
+            columns.append(raw.reshape(self.parts, -1).numpy())
         point = np.concatenate(columns, axis=1)[:, self.free].reshape(-1) if columns else np.zeros(0)
         return self._inside(point)
 
@@ -236,13 +259,13 @@ class _Search:
         return np.asarray(np.clip(point, lower, upper))
 
     def evaluate(self, point: Array) -> tuple[Array, Array, Array]:
-        """Objective and likelihood `(axes,)`, gradient of the objective `(axes, free)`, known or computed."""
+        """Objective and likelihood `(parts,)`, gradient of the objective `(parts, free)`, known or computed."""
         known = None if self.journal is None else self.journal.find(point)
         if known is not None:
             return (
-                known[: self.axes],
-                known[self.axes : 2 * self.axes],
-                known[2 * self.axes :].reshape(self.axes, -1),
+                known[: self.parts],
+                known[self.parts : 2 * self.parts],
+                known[2 * self.parts :].reshape(self.parts, -1),
             )
         computed = self.compute(point)
         if self.journal is not None:
@@ -259,10 +282,10 @@ class _Search:
         if raws:
             value.sum().backward()
             # A hyperparameter that the data do not touch still has its hyperprior's gradient.
-            parts = [_gradient(raw).reshape(self.axes, -1).numpy() for raw in raws]
+            parts = [_gradient(raw).reshape(self.parts, -1).numpy() for raw in raws]
             gradient = np.concatenate(parts, axis=1)[:, self.free]
         else:
-            gradient = np.zeros((self.axes, 0))
+            gradient = np.zeros((self.parts, 0))
         if not (bool(value.isfinite().all()) and np.isfinite(gradient).all()):
             raise NotPositiveDefiniteError(
                 "expected a finite likelihood of the forces, found one that overflows, or its gradient does; check "
@@ -280,7 +303,7 @@ class _Search:
         self.best_objective = np.where(best, value, self.best_objective)
         self.best_likelihood = np.where(best, likelihood, self.best_likelihood)
         self.best_restart = np.where(best, self.restart, self.best_restart)
-        self.best_point = np.where(best[:, None], point.reshape(self.axes, -1), self.best_point)
+        self.best_point = np.where(best[:, None], point.reshape(self.parts, -1), self.best_point)
         return -float(value.sum()), -gradient.reshape(-1)
 
     def report(self, _: Array) -> None:
@@ -298,18 +321,18 @@ class _Search:
         self.unpack(self.best_point)
 
     def _bounds(self) -> list[tuple[float, float]]:
-        one_axis: list[tuple[float, float]] = []
+        one_part: list[tuple[float, float]] = []
         for entry in self.entries:
             bounded = bool(torch.isfinite(entry.constraint.upper_bound).all())
-            for spec in entry.specs:
+            for spec in entry.specs * self._members(entry):
                 if spec.fixed:
                     continue
                 if bounded:
-                    one_axis.append((-INTERVAL_BOUND, INTERVAL_BOUND))
+                    one_part.append((-INTERVAL_BOUND, INTERVAL_BOUND))
                 else:
                     centre, width = np.log(spec.median) / entry.power, BOUND * spec.log_sd / entry.power
-                    one_axis.append((centre - width, centre + width))
-        return one_axis * self.axes
+                    one_part.append((centre - width, centre + width))
+        return one_part * self.parts
 
 
 def _gradient(raw: torch.nn.Parameter) -> Tensor:
@@ -317,10 +340,10 @@ def _gradient(raw: torch.nn.Parameter) -> Tensor:
 
 
 def _laplace(search: _Search) -> dict[str, list[list[float]]]:
-    """SD of log h from the curvature at the optimum: central differences of the gradient, all axes at once."""
+    """SD of log h from the curvature at the optimum: central differences of the gradient, all parts at once."""
     point = search.best_point
     size = point.shape[1]
-    hessian = np.zeros((search.axes, size, size))
+    hessian = np.zeros((search.parts, size, size))
     for column in range(size):
         step = np.zeros_like(point)
         step[:, column] = HESSIAN_STEP
@@ -331,19 +354,19 @@ def _laplace(search: _Search) -> dict[str, list[list[float]]]:
         hessian[:, column] = -(above - below) / (2.0 * HESSIAN_STEP)
     search.restore()
     hessian = 0.5 * (hessian + hessian.transpose(0, 2, 1))
-    raw_sd = np.array([_standard_deviations(h) for h in hessian]).reshape(search.axes, size)
-    spread = np.full((search.axes, search.free.size), np.nan)
+    raw_sd = np.array([_standard_deviations(h) for h in hessian]).reshape(search.parts, size)
+    spread = np.full((search.parts, search.free.size), np.nan)
     spread[:, search.free] = raw_sd
     result: dict[str, list[list[float]]] = {}
     column = 0
     for entry in search.entries:
-        width = len(entry.specs)
+        width = entry.raw.numel() // search.parts
         # d log h / d raw: `power` for a logarithmic constraint, less inside an interval.
         raw = entry.raw.detach().clone().requires_grad_()
         log_value = entry.power * entry.constraint.transform(raw).log()
         (slope,) = torch.autograd.grad(log_value.sum(), raw)
-        scaled = spread[:, column : column + width] * slope.reshape(search.axes, -1).numpy()
-        result[entry.name] = scaled.tolist()
+        scaled = spread[:, column : column + width] * slope.reshape(search.parts, -1).numpy()
+        result[entry.name] = scaled.reshape(-1, len(entry.specs)).tolist()
         column += width
     return result
 

@@ -53,6 +53,7 @@ def test_shipped_configurations_are_these():
         "time",
         "phase",
         "admittance",
+        "coupled",
         "position",
         "position_velocity",
         "recordings/delta_robot",
@@ -112,7 +113,8 @@ def test_unknown_name_lists_or_suggests_the_shipped_ones(tmp_path):
     with pytest.raises(ConfigurationError, match=r"found neither at 'phse'; did you mean 'phase'\?"):
         load_config("phse")
     with pytest.raises(
-        ConfigurationError, match="shipped are admittance, phase, position, position_velocity, rec.*, time"
+        ConfigurationError,
+        match="shipped are admittance, coupled, phase, position, position_velocity, rec.*, time",
     ):
         load_config(tmp_path / "nothing" / "like" / "it.json")
 

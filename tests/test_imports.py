@@ -114,6 +114,8 @@ KERNELS = (
     "kernels.warped",
     "kernels.motion_noise",
     "kernels.impedance",
+    "kernels.coupled_terms",
+    "kernels.coupled",
     "kernels",
 )
 ENGINES = (
@@ -167,6 +169,8 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             set(ENGINES),
             IMPEDANCE_FUNCTIONS,
             {"training"},
+            {"conditioning"},
+            {"coupled_posterior"},
             {"posterior"},
             {
                 "identifiability",

@@ -110,6 +110,8 @@ def acts(config: Config, key: str) -> bool:
     model = config.model
     if rest == ["shape"]:
         return model.desired_trajectory.kernel == "rational_quadratic"
+    if rest == ["coupling"]:
+        return model.axes == "coupled"
     if rest[:1] != ["length_scale"]:
         return True
     if section == "desired_trajectory":

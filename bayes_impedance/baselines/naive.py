@@ -56,11 +56,12 @@ class NaiveModel:
 
 
 def naive_config(config: Config) -> Config:
-    """`config` with the baseline's inputs as those of the residual, and no prior mean."""
+    """`config` with the baseline's inputs as those of the residual, and no prior mean; its axes are independent."""
     residual = config.model.residual or ResidualPrior()
     components = baseline_components(config)
     model = config.model.model_copy(
         update={
+            "axes": "independent",
             "desired_trajectory": DesiredTrajectoryPrior(mean="equilibrium"),
             "residual": residual.model_copy(update={"input": components, "offset_sd": None}),
         }

@@ -7,10 +7,10 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Self, get_args
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ValidationError, model_validator
 
 from bayes_impedance.config.inference import BaselineConfig, EngineConfig, TrainingConfig
 from bayes_impedance.config.log import LogConfig
@@ -34,6 +34,58 @@ class Config(Section):
     engine: EngineConfig = EngineConfig()
     training: TrainingConfig = TrainingConfig()
     baseline: BaselineConfig = BaselineConfig()
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        moments = self.engine.impedance == "moments"
+        # Around the hand itself no acceleration enters the force, and so no Jacobian.
+        answers = self.device is not None and self.model.desired_trajectory.mean != "equilibrium"
+        if self.model.axes == "coupled" and moments and answers:
+            raise ValueError(
+                "device: with model.axes: coupled the Jacobian of the closed loop is the determinant of a matrix, "
+                "which engine.impedance: moments has no closed form for; set engine.impedance=map, or "
+                "model.axes=independent, or leave device out"
+            )
+        for complaint in (_moments_only(self), _map_only(self)):
+            if complaint is not None:
+                raise ValueError(complaint)
+        return self
+
+
+def _map_only(config: Config) -> str | None:
+    """What only impedance as a function can have."""
+    if config.engine.impedance == "map":
+        return None
+    if config.model.mass.input:
+        return (
+            "model.mass.input: expected no input with engine.impedance: moments, whose mass is one number a group, got "
+            f"{', '.join(config.model.mass.input)}; set engine.impedance=map, or model.mass.input=[]"
+        )
+    if config.model.desired_trajectory.periodic:
+        return (
+            "model.desired_trajectory.periodic: expected false with engine.impedance: moments, whose kernel has two "
+            "ends, got true; set engine.impedance=map, or model.desired_trajectory.periodic=false"
+        )
+    return None
+
+
+def _moments_only(config: Config) -> str | None:
+    """What only impedance that is integrated out can have."""
+    if config.engine.impedance == "moments":
+        return None
+    for name in ("stiffness", "damping"):
+        prior = getattr(config.model, name).prior
+        if prior != "log_gp":
+            return (
+                f"model.{name}.prior: expected log_gp with engine.impedance: map, which keeps impedance positive, got "
+                f"{prior}; set model.{name}.prior=log_gp"
+            )
+    if config.model.position_noise_sd is not None:
+        return (
+            "model.position_noise_sd: expected null with engine.impedance: map, which takes the recorded motion as it "
+            "is, got a noise; set model.position_noise_sd=null, or engine.impedance=moments"
+        )
+    return None
 
 
 def shipped_configurations() -> dict[str, Path]:

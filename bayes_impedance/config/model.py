@@ -97,9 +97,10 @@ class DampingPrior(ImpedancePrior):
 
 
 class MassPrior(Section):
-    """Mass m ~ N(level, sd²) [kg], one for each group; `coupling` as for stiffness.
+    """Mass m ~ N(level, sd²) [kg], one for each group; where axes are coupled log-normal with the median `level`.
 
     Where it depends on an `input`, as that of an arm does on posture, log m ~ GP(log median, log_sd²) instead.
+    `coupling` as for stiffness.
     """
 
     level: Scale = learned(1.5, 0.7)
@@ -176,6 +177,12 @@ class ModelConfig(Section):
                 "position_noise_sd: with desired_trajectory.mean: equilibrium the position cancels from x_d − x, and "
                 "its noise with it; set position_noise_sd to null, or take another mean"
             )
+        for name in ("stiffness", "damping") if self.axes == "coupled" else ():
+            if getattr(self, name).prior == "gp":
+                raise ValueError(
+                    f"{name}.prior: expected log_gp with axes: coupled, whose matrices are made of positive terms, got "
+                    f"gp; set model.{name}.prior=log_gp (and log_sd in place of sd), or model.axes=independent"
+                )
         if self.desired_trajectory.periodic and self.trajectory_input != "phase":
             raise ValueError(
                 "desired_trajectory.periodic: expected trajectory_input: phase with it, whose ends it joins, got "

@@ -28,7 +28,8 @@ class Observations:
     """What the dense engine conditions on.
 
     `inputs` `(*batch, n, D)`; `residual` u − E[u] `(*batch, n)` [N]; `noise_variance` σ_r² `(*batch, 1)`
-    [N²]; `valid` `(*batch, n)` is False where a sample only pads a batch of groups of unequal length.
+    [N²]; `valid` `(*batch, n)` is False where a sample only pads a batch of groups of unequal length. Of a kernel with
+    q outputs an input, which has q rows a sample, `residual`, `valid` and `noise_variance` are `(*batch, n · q)`.
     """
 
     inputs: Tensor
@@ -140,15 +141,19 @@ class _QuadraticForms(torch.autograd.Function):
         weight = torch.cholesky_inverse(cholesky).mul_(grad_log_det[..., None, None])
         weight.sub_(0.5 * (solved @ symmetric) @ solved.mT)
         diagonal = weight.diagonal(dim1=-2, dim2=-1)
-        noise_gradient = _masked(diagonal, valid).sum(-1, keepdim=True)
+        noise_gradient = _masked(diagonal, valid)
+        if observations.noise_variance.shape[-1] == 1:
+            noise_gradient = noise_gradient.sum(-1, keepdim=True)
         noise_gradient = _sum_to(noise_gradient, observations.noise_variance.shape)
 
         parameters = [p for p in kernel.parameters() if p.requires_grad]
         gradients = [torch.zeros_like(p) for p in parameters]
-        for start, stop in _blocks(observations.inputs) if parameters else ():
-            block_weight = _masked_block(weight[..., start:stop, :stop], valid, start, stop)
+        outputs = _outputs(kernel, observations.inputs)
+        for start, stop in _blocks(observations.inputs, outputs) if parameters else ():
+            first, last = start * outputs, stop * outputs
+            block_weight = _masked_block(weight[..., first:last, :last], valid, first, last)
             # Below the diagonal each entry stands for itself and for its mirror image.
-            block_weight[..., :start].mul_(2.0)
+            block_weight[..., :first].mul_(2.0)
             with torch.enable_grad():
                 block = _block(kernel, observations.inputs, start, stop)
                 parts = torch.autograd.grad(
@@ -162,12 +167,14 @@ class _QuadraticForms(torch.autograd.Function):
 
 def _cholesky(kernel: Kernel, observations: Observations, jitter: float) -> Tensor:
     inputs, valid = observations.inputs, observations.valid
-    n = inputs.shape[-2]
+    outputs = _outputs(kernel, inputs)
+    n = inputs.shape[-2] * outputs
     batch = torch.broadcast_shapes(inputs.shape[:-2], kernel.batch_shape, observations.residual.shape[:-1])
     covariance = inputs.new_zeros(*batch, n, n)
-    for start, stop in _blocks(inputs):
+    for start, stop in _blocks(inputs, outputs):
+        first, last = start * outputs, stop * outputs
         block = _block(kernel, inputs, start, stop)
-        covariance[..., start:stop, :stop] = _masked_block(block, valid, start, stop)
+        covariance[..., first:last, :last] = _masked_block(block, valid, first, last)
     diagonal = covariance.diagonal(dim1=-2, dim2=-1)
     count = n if valid is None else valid.sum(-1, keepdim=True)
     added = jitter * diagonal.sum(-1, keepdim=True) / count + observations.noise_variance
@@ -187,9 +194,14 @@ def _block(kernel: Kernel, inputs: Tensor, start: int, stop: int) -> Tensor:
     return evaluate(kernel, inputs[..., start:stop, :], inputs[..., :stop, :])
 
 
-def _blocks(inputs: Tensor) -> Iterator[tuple[int, int]]:
+def _outputs(kernel: Kernel, inputs: Tensor) -> int:
+    """Rows of the covariance that belong to one input."""
+    return int(kernel.num_outputs_per_input(inputs, inputs))
+
+
+def _blocks(inputs: Tensor, outputs: int) -> Iterator[tuple[int, int]]:
     n = inputs.shape[-2]
-    rows = max(16, BLOCK_ENTRIES // max(1, n * math.prod(inputs.shape[:-2])))
+    rows = max(16, BLOCK_ENTRIES // max(1, n * outputs**2 * math.prod(inputs.shape[:-2])))
     for start in range(0, n, rows):
         yield start, min(start + rows, n)
 

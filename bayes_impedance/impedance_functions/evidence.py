@@ -5,9 +5,9 @@ the data determine uses up one of their samples. The evidence has −½ log det 
 Its gradient by the hyperparameters, at a fixed mode, is linear algebra with second differences of the likelihood, and
 enters as a tilt of the joint density.
 
-How far and how quickly impedance varies along its input needs no likelihood at all. At the mode the log likelihood is replaced by its quadratic in the functions' values at the inducing inputs, other
-hyperparameters marginalised. The integral over the functions is then closed, for any log-SD s and length scale ℓ, and
-its maximum is found without another evaluation of the likelihood. Mode and hyperparameters take turns.
+How far and how quickly impedance varies along its input needs no likelihood at all. At the mode the log likelihood is
+replaced by its quadratic in the functions' values at the inducing inputs, other hyperparameters marginalised. The
+integral over the functions is then closed, for any log-SD s and length scale ℓ. Mode and hyperparameters take turns.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ LARGEST_MOVE = 1.0
 def occam(density: Density, mode: Array, precision: Array) -> Array:
     """Gradient of −½ log det H by the hyperparameters of `density`, `(size,)`, zero for the weights.
 
-    ∂ log det H = tr H⁻¹ ∂H = E[sᵀ ∂H s] with s ~ N(0, H⁻¹), and sᵀ H s is minus the second difference of the log density
-    along s (Hutchinson's estimate).
+    ∂ log det H = tr H⁻¹ ∂H = E[sᵀ ∂H s] with s ~ N(0, H⁻¹), and sᵀ H s is minus the second difference of the log
+    density along s (Hutchinson's estimate).
     """
     count = density.weight_count
     values, vectors = np.linalg.eigh(precision[:count, :count])

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from bayes_impedance.config import Config, Hyperparameter, ImpedancePrior, MassPrior
-from bayes_impedance.errors import ConfigurationError
 from bayes_impedance.features import Features
 from bayes_impedance.impedance_functions.inducing import inducing_inputs
 from bayes_impedance.impedance_functions.symmetric import entries, exponential
@@ -109,17 +108,12 @@ def choose_inducing(config: Config, model: ForceModel, features: Features) -> tu
 def build_functions(
     config: Config, model: ForceModel, inducing: Sequence[Tensor | None]
 ) -> tuple[ImpedanceFunction, ...]:
-    """K, D and M under the priors of `config`, at the hyperparameters of `model`.
-
-    Raises:
-        ConfigurationError: a prior that is not positive.
-    """
+    """K, D and M under the priors of `config`, at the hyperparameters of `model`."""
     impedance = model.kernel.impedance
     axes = impedance.trajectory.batch_shape[0]
     places = entries(axes, config.model.axes == "coupled")
     functions = []
     for process, prior, own in zip(impedance.processes, _priors(config), inducing, strict=True):
-        _check_positive(prior)
         functions.append(_function(process, prior, places, own))
     return tuple(functions)
 
@@ -162,11 +156,3 @@ def _constant_log_sd(prior: ImpedancePrior | MassPrior) -> float:
     if isinstance(prior, MassPrior):
         return prior.sd.median / prior.level.median
     return prior.scale.median
-
-
-def _check_positive(prior: ImpedancePrior | MassPrior) -> None:
-    if isinstance(prior, ImpedancePrior) and prior.prior != "log_gp":
-        raise ConfigurationError(
-            f"model: expected prior: log_gp with engine.impedance: map, which keeps impedance positive, got "
-            f"{prior.prior}; set model.stiffness.prior and model.damping.prior to log_gp"
-        )

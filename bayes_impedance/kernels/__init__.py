@@ -1,5 +1,8 @@
 """Covariances of the interaction force, as ordinary gpytorch kernels."""
 
+from bayes_impedance.kernels.coupled import CoupledImpedanceKernel as CoupledImpedanceKernel
+from bayes_impedance.kernels.coupled import CoupledInteractionKernel as CoupledInteractionKernel
+from bayes_impedance.kernels.coupled_terms import CoupledProcess as CoupledProcess
 from bayes_impedance.kernels.impedance import ImpedanceKernel as ImpedanceKernel
 from bayes_impedance.kernels.impedance import InputLayout as InputLayout
 from bayes_impedance.kernels.impedance import InteractionKernel as InteractionKernel

@@ -52,7 +52,7 @@ class MotionNoiseKernel(BatchedKernel):
             sample, its place in it, length of the window (0: no noise), order of the polynomial, native step [s], and
             how many of position, velocity and acceleration come from the recorded positions.
         processes: priors of k, d and m, those of the `ImpedanceKernel`, whose parts they stay: their hyperparameters
-            are not listed here.
+            are not listed here. None where axes couple, of which only `smoothed` is asked.
         weights: the filter.
         sd_prior: prior of σ_x.
 
@@ -117,6 +117,12 @@ class MotionNoiseKernel(BatchedKernel):
         total = block.new_zeros(*block.shape[:-2], *anywhere.shape)
         total[..., rows.unsqueeze(-1), columns] = block
         return total
+
+    def smoothed(self, x1: Tensor, x2: Tensor, diag: bool = False) -> Tensor:
+        """S_ij/σ_x² of every pair of samples, `(..., n1, n2, 3, 3)`, or `(..., n, 3, 3)` with `diag` [s^−(i + j)]."""
+        if diag:
+            return self._smoothed(self._smoothing(x1), self._smoothing(x2))
+        return self._smoothed(*self._pairs(x1, x2))
 
     def _smoothing(self, x: Tensor) -> _Smoothing:
         return _Smoothing(*(x[..., column] for column in self.columns))

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
+from gpytorch import Module
 from gpytorch.constraints import Interval, Positive
 from gpytorch.kernels import Kernel
 from gpytorch.priors import Prior
@@ -318,7 +319,7 @@ def stack_columns(*parts: Tensor) -> Tensor:
 
 
 def register_positive(
-    module: Kernel, name: str, batch_shape: torch.Size, prior: Prior | None, constraint: Interval | None
+    module: Module, name: str, batch_shape: torch.Size, prior: Prior | None, constraint: Interval | None
 ) -> None:
     """Register a positive hyperparameter `name` of shape `(*batch, 1, 1)`, with its constraint and prior."""
     module.register_parameter(f"raw_{name}", torch.nn.Parameter(torch.zeros(*batch_shape, 1, 1)))
@@ -327,7 +328,7 @@ def register_positive(
         module.register_prior(f"{name}_prior", prior, name)
 
 
-def set_positive(module: Kernel, name: str, value: Tensor | float) -> None:
+def set_positive(module: Module, name: str, value: Tensor | float) -> None:
     """Set hyperparameter `name` to `value` in its natural unit."""
     raw = getattr(module, f"raw_{name}")
     constraint = getattr(module, f"raw_{name}_constraint")

@@ -1,7 +1,7 @@
 """Data drawn from the model itself: true products of drawn impedance and drawn desired trajectory.
 
-Nothing here is Gaussian in u, because u = Σ_j w_j e⁽ʲ⁾ + ũ + ε is formed as it stands; the truth of
-every latent is kept beside the force.
+Nothing here is Gaussian in u, because u = Σ_j w_j e⁽ʲ⁾ + ũ + ε is formed as it stands, with matrices in place of w_j
+where axes are coupled; the truth of every latent is kept beside the force.
 """
 
 from __future__ import annotations
@@ -17,8 +17,11 @@ from torch import Tensor
 
 from bayes_impedance.config import Config
 from bayes_impedance.features import FeatureMap, Features
+from bayes_impedance.kernels.coupled import CoupledInteractionKernel
+from bayes_impedance.kernels.coupled_terms import CoupledProcess, contract
 from bayes_impedance.kernels.derivative import derivative_table
 from bayes_impedance.kernels.impedance import same_label
+from bayes_impedance.kernels.warped import ImpedanceProcess
 from bayes_impedance.log import InteractionLog, Trial
 from bayes_impedance.preprocessing import PreparedLog, PreparedTrial
 from bayes_impedance.priors import ForceModel, build_force_model
@@ -107,17 +110,34 @@ def draw_force(
         desired, impedance, residual, noise = (part[:, rows] for part in drawn[trial.group])
         hand = np.stack([trial.position.T, trial.velocity.T, trial.acceleration.T], axis=-1)
         # u = Σ_j w_j e⁽ʲ⁾ + ũ + ε, with w = (k, d, m)
-        force = (impedance * (desired - hand)).sum(-1) + residual + noise
+        force = _impedance_force(impedance, desired - hand) + residual + noise
         truth: dict[str, Array] = {}
         for a, axis in enumerate(motion.axes):
             truth[f"desired_position_{axis}"] = desired[a, :, 0]
             truth[f"desired_velocity_{axis}"] = desired[a, :, 1]
             truth[f"desired_acceleration_{axis}"] = desired[a, :, 2]
             truth[f"residual_force_{axis}"] = residual[a]
-            for j, name in enumerate(("stiffness", "damping", "mass")):
-                truth[f"{name}_{axis}{axis}"] = impedance[a, :, j]
+            truth |= _impedance_truth(impedance, a, motion.axes)
         trials.append(replace(trial, force=np.ascontiguousarray(force.T), truth=truth))
     return PreparedLog(motion.axes, tuple(trials))
+
+
+def _impedance_force(impedance: Array, error: Array) -> Array:
+    """Σ_j w_j e⁽ʲ⁾, `(axes, n)`, of `impedance` `(axes, n, 3)`, or `(axes, n, 3, axes)` where axes are coupled."""
+    if impedance.ndim == 3:
+        return np.asarray((impedance * error).sum(-1))
+    return np.einsum("anjc,cnj->an", impedance, error)
+
+
+def _impedance_truth(impedance: Array, a: int, axes: tuple[str, ...]) -> dict[str, Array]:
+    """Impedance of axis number `a`, and where axes are coupled with those after it."""
+    truth: dict[str, Array] = {}
+    for j, name in enumerate(("stiffness", "damping", "mass")):
+        if impedance.ndim == 3:
+            truth[f"{name}_{axes[a]}{axes[a]}"] = impedance[a, :, j]
+        else:
+            truth |= {f"{name}_{axes[a]}{axes[b]}": impedance[a, :, j, b] for b in range(a, len(axes))}
+    return truth
 
 
 def as_recording(prepared: PreparedLog, *, keep_reference: bool = False) -> InteractionLog:
@@ -136,7 +156,10 @@ def as_recording(prepared: PreparedLog, *, keep_reference: bool = False) -> Inte
 def _draw_group(
     model: ForceModel, features: Features, group: int, generator: torch.Generator
 ) -> tuple[Array, Array, Array, Array]:
-    """Desired trajectory `(axes, n, 3)`, impedance `(axes, n, 3)`, residual and noise `(axes, n)`."""
+    """Desired trajectory and impedance `(axes, n, 3)`, residual and noise `(axes, n)`.
+
+    Where axes are coupled impedance is `(axes, n, 3, axes)`.
+    """
     n = len(features.rows[group])
     x = features.inputs[:, group : group + 1, :n]
     kernel = model.kernel
@@ -150,16 +173,28 @@ def _draw_group(
     desired = features.trajectory_mean[:, group : group + 1, :n] + torch.stack(
         deviation.split(n, dim=-1), dim=-1
     )
-    columns = []
-    for process in impedance.processes:
-        draw = _sample(process.gaussian_covariance(x, x), generator)
-        level = process.level[..., 0]
-        columns.append(level + draw if process.law == "gaussian" else level * draw.exp())
-    residual = _sample(kernel.residual_covariance(x, x), generator)
+    columns = [_draw_impedance(process, x, generator) for process in impedance.processes]
+    coupled = isinstance(kernel, CoupledInteractionKernel)
+    own = kernel.axis_residuals(x[0], x[0]) if coupled else kernel.residual_covariance(x, x)
+    residual = _sample(own, generator)
     standard = torch.randn(residual.shape, generator=generator, dtype=residual.dtype)
     noise = model.noise_variance.sqrt() * standard
-    parts = (desired, torch.stack(columns, dim=-1), residual, noise)
+    parts = (desired, torch.stack(columns, dim=3), residual, noise)
     return tuple(part[:, 0].numpy() for part in parts)  # type: ignore[return-value]
+
+
+def _draw_impedance(
+    process: ImpedanceProcess | CoupledProcess, x: Tensor, generator: torch.Generator
+) -> Tensor:
+    """One of k, d, m at the rows of `x` `(axes, 1, n, D)`: `(axes, 1, n)`, or `(axes, 1, n, axes)` of a matrix."""
+    if isinstance(process, CoupledProcess):
+        n = x.shape[-2]
+        covariance = process.gaussian_covariance(x[0], x[0])
+        draw = _sample(covariance.expand(*covariance.shape[:-2], n, n), generator)
+        return contract(process.dyads, process.levels[..., 0] * draw.exp()).movedim(1, -1)
+    draw = _sample(process.gaussian_covariance(x, x), generator)
+    level = process.level[..., 0]
+    return level + draw if process.law == "gaussian" else level * draw.exp()
 
 
 def _sample(covariance: Tensor, generator: torch.Generator) -> Tensor:

@@ -1,0 +1,77 @@
+"""What posteriors of independent and of coupled axes have in common: batches, levels as offsets, logarithms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from bayes_impedance.features import Features
+from bayes_impedance.priors import Entry, ForceModel
+
+#: Location, variance, prior location, prior variance, each `(axes, groups, m)`.
+Moments = tuple[Tensor, Tensor, Tensor, Tensor]
+
+#: Targets are taken this many at a time, which bounds memory whatever the length of the log.
+CHUNK = 512
+
+
+def entry_of(model: ForceModel, name: str) -> Entry:
+    """The hyperparameter of that name."""
+    return next(entry for entry in model.entries if entry.name == name)
+
+
+def offset_covariance(white_loading: Tensor, variance: Tensor) -> Tensor:
+    """Covariance of offsets b ~ N(0, diag V) that load on forces by A, given these: V½ (I + V½ AᵀK⁻¹A V½)⁻¹ V½.
+
+    `white_loading` L⁻¹A `(*batch, n, b)`, `variance` V `(*batch, b)`; defined for V = 0 too.
+    """
+    gram = white_loading.mT @ white_loading
+    root = variance.sqrt()
+    scaled = root.unsqueeze(-1) * gram * root.unsqueeze(-2)
+    inner = torch.linalg.inv(torch.eye(gram.shape[-1], dtype=gram.dtype) + scaled)
+    return root.unsqueeze(-1) * inner * root.unsqueeze(-2)
+
+
+def unwarped(location: Tensor, prior_location: Tensor, variance: Tensor, prior_variance: Tensor) -> Tensor:
+    """Location of log w to second order: that of the log-normal whose moments are those of w given the forces.
+
+    To first order E[w|u] = E[w] (1 + a) with the shift a of log w, and E[w] = exp(location + ½ prior variance). The
+    logarithm of 1 + a is replaced by its expansion below zero, where a linear estimate of w may become negative.
+    """
+    a = location - prior_location
+    log = torch.where(a > 0.0, torch.log1p(a.clamp_min(0.0)), a - 0.5 * a.square())
+    return prior_location + 0.5 * (prior_variance - variance) + log
+
+
+def select_groups(features: Features, groups: Sequence[str]) -> Features:
+    """The features of some groups, in that order."""
+    index = [features.groups.index(group) for group in groups]
+    return replace(
+        features,
+        groups=tuple(groups),
+        inputs=features.inputs[:, index],
+        force=None if features.force is None else features.force[:, index],
+        trajectory_mean=features.trajectory_mean[:, index],
+        valid=None if features.valid is None else features.valid[index],
+        rows=tuple(features.rows[i] for i in index),
+        loop=None if features.loop is None else features.loop.select(index),
+    )
+
+
+def chunks(features: Features) -> list[Features]:
+    """The inputs in pieces of `CHUNK` samples, without force."""
+    starts = range(0, features.inputs.shape[2], CHUNK)
+    pieces = [slice(start, start + CHUNK) for start in starts]
+    return [
+        replace(
+            features,
+            inputs=features.inputs[:, :, piece],
+            force=None,
+            trajectory_mean=features.trajectory_mean[:, :, piece],
+            valid=None,
+        )
+        for piece in pieces
+    ]

@@ -1,0 +1,207 @@
+"""Posteriors where axes are coupled: the logarithms of the terms of K, D and M, jointly at each sample.
+
+Every latent is conditioned on the forces of all axes together. Levels that were learned enter as Gaussian offsets b of
+log level and log coupling (see `posterior`), of which a pair's terms take their share: g_r gains Σ_b T_rb b.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from bayes_impedance.conditioning import Moments, chunks, entry_of, offset_covariance, unwarped
+from bayes_impedance.engines.dense import Factor
+from bayes_impedance.features import Features
+from bayes_impedance.kernels.coupled import CoupledInteractionKernel, by_axis, join_axes, rows_of
+from bayes_impedance.kernels.coupled_terms import CoupledProcess, term_directions
+from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, TRAJECTORY_ORDER, Latent
+from bayes_impedance.priors import ForceModel
+from bayes_impedance.training import observations
+
+Array = NDArray[np.float64]
+
+#: Location and covariance of the terms, then those of their prior: `(groups, m, terms)`, `(groups, m, terms, terms)`.
+TermMoments = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+@dataclass(frozen=True)
+class LogTerms:
+    """Gaussian posterior of g_r in W = Σ_r a_r a_rᵀ e^{g_r} at each sample, beside its prior.
+
+    `location` `(samples, terms)`, `covariance` `(samples, terms, terms)`: of the logarithm of each term in the unit of
+    W; the terms are those of `term_directions`.
+
+    Example:
+        >>> prior = np.log([[200.0, 200.0, 60.0, 60.0]]), 0.01 * np.eye(4)[None]
+        >>> stiffness = LogTerms(2, *prior, *prior)
+        >>> mean, variance = stiffness.moments()
+        >>> mean.round().tolist(), stiffness.draw(2, np.random.default_rng(0)).shape
+        ([[[261.0, 0.0], [0.0, 261.0]]], (2, 1, 2, 2))
+    """
+
+    axes: int
+    location: Array
+    covariance: Array
+    prior_location: Array
+    prior_covariance: Array
+
+    def moments(self, prior: bool = False) -> tuple[Array, Array]:
+        """Mean and variance of the entries of W, `(samples, axes, axes)` each [unit of W and its square].
+
+        E_r = exp(μ_r + ½ Σ_rr), Cov[e^{g_r}, e^{g_s}] = E_r E_s (e^{Σ_rs} − 1).
+        """
+        location, covariance = self._gaussian(prior)
+        expected = np.exp(location + 0.5 * covariance.diagonal(axis1=1, axis2=2))
+        spread = expected[:, :, None] * expected[:, None] * np.expm1(covariance)
+        dyads = self._dyads()
+        mean = np.einsum("rab,nr->nab", dyads, expected)
+        return mean, np.einsum("rab,sab,nrs->nab", dyads, dyads, spread, optimize=True)
+
+    def draw(self, draws: int, generator: np.random.Generator, prior: bool = False) -> Array:
+        """Matrices W, `(draws, samples, axes, axes)` [unit of W]; samples are drawn each on its own."""
+        location, covariance = self._gaussian(prior)
+        values, vectors = np.linalg.eigh(covariance)
+        # Rounding can push the variance of a fully determined direction just below zero.
+        roots = vectors * np.sqrt(values.clip(min=0.0))[:, None]
+        standard = generator.standard_normal((draws, *location.shape))
+        terms = np.exp(location + np.einsum("nrs,dns->dnr", roots, standard))
+        return np.einsum("rab,dnr->dnab", self._dyads(), terms)
+
+    def _gaussian(self, prior: bool) -> tuple[Array, Array]:
+        if prior:
+            return self.prior_location, self.prior_covariance
+        return self.location, self.covariance
+
+    def _dyads(self) -> Array:
+        directions: Array = term_directions(self.axes).numpy()
+        return directions[:, :, None] * directions[:, None]
+
+
+class CoupledConditioner:
+    """Forces of all axes given once, conditioned on for any number of targets; without `given` the prior.
+
+    Raises:
+        NotPositiveDefiniteError: the covariance of the given forces does not factorise.
+    """
+
+    def __init__(self, model: ForceModel, given: Features | None, jitter: float) -> None:
+        self.model = model
+        self.kernel: CoupledInteractionKernel = model.kernel
+        self.variance = torch.cat([_level_variance(model, latent) for latent in IMPEDANCE_ORDER])
+        self.factor: Factor | None = None
+        if given is not None:
+            self.inputs = self._joined(given)
+            self.factor = Factor(self.kernel, observations(model, given), jitter)
+            self.white_loading = self.factor.whiten(self._level_loading(self.inputs))
+            self.level_covariance = offset_covariance(self.white_loading, self.variance)
+
+    def moments(self, target: Features, latents: Sequence[Latent]) -> dict[Latent, Moments]:
+        """Moments of latents that are no impedance, `(axes, groups, m)` each."""
+        return {
+            latent: _joined_pieces([self._latent(piece, latent) for piece in chunks(target)], dim=-1)
+            for latent in latents
+            if latent not in IMPEDANCE_ORDER
+        }
+
+    def terms(self, target: Features, latents: Sequence[Latent]) -> dict[Latent, TermMoments]:
+        """Moments of the terms of each impedance."""
+        return {
+            latent: _joined_pieces([self._terms(piece, IMPEDANCE_ORDER[latent], latent) for piece in chunks(target)], 1)
+            for latent in latents
+            if latent in IMPEDANCE_ORDER
+        }  # fmt: skip
+
+    def _joined(self, features: Features) -> Tensor:
+        return join_axes(features.inputs, self.kernel.impedance.layout)
+
+    def _latent(self, target: Features, latent: Latent) -> Moments:
+        x = self._joined(target)
+        own = self.kernel.prior_variance(x, latent)
+        prior_location = self._prior_location(target, x, latent).expand_as(own)
+        loading = x.new_zeros(*own.shape, len(self.variance))
+        noise = torch.zeros((), dtype=x.dtype)
+        if latent is Latent.FORCE:
+            loading = self._level_loading(x)
+            noise = self.model.noise_variance.reshape(-1).repeat(x.shape[-2])
+        prior_variance = own + (loading.square() * self.variance).sum(-1) + noise
+        location, variance = prior_location, prior_variance
+        if self.factor is not None:
+            cross = self.kernel.cross_covariance(self.inputs, x, latent)
+            white = self.factor.whiten(cross)
+            # On padding α is zero.
+            location = prior_location + (cross.mT @ self.factor.alpha.unsqueeze(-1)).squeeze(-1)
+            known = (own - white.square().sum(-2)).clamp_min(0.0)
+            rest = loading - white.mT @ self.white_loading
+            variance = known + ((rest @ self.level_covariance) * rest).sum(-1) + noise
+        rows = (location, variance, prior_location, prior_variance)
+        a, b, c, d = (by_axis(part, self.kernel.impedance.axes) for part in rows)
+        return a, b, c, d
+
+    def _prior_location(self, target: Features, x: Tensor, latent: Latent) -> Tensor:
+        if latent is Latent.FORCE:
+            return self.kernel.prior_mean(x)
+        if latent is Latent.RESIDUAL_FORCE:
+            return torch.zeros((), dtype=x.dtype)
+        return rows_of(target.trajectory_mean[..., TRAJECTORY_ORDER[latent]])
+
+    def _terms(self, target: Features, order: int, latent: Latent) -> TermMoments:
+        x = self._joined(target)
+        process = self.kernel.impedance.processes[order]
+        count = len(process.shares)
+        shape = (*x.shape[:-1], count)
+        own = process.gaussian_covariance(x, x, diag=True).movedim(0, -1).expand(shape)
+        before, shown = process.levels.log().reshape(-1), _median_levels(self.model, process, latent).log()
+        loading = x.new_zeros(count, len(self.variance))
+        loading[:, order * count : (order + 1) * count] = process.offsets
+        prior_covariance = torch.diag_embed(own) + (loading * self.variance) @ loading.mT
+        if self.factor is None:
+            location = before.expand(shape)
+            return location, prior_covariance, shown.reshape(-1).expand(shape), prior_covariance
+        cross = self.kernel.impedance.term_covariance(self.inputs, x, order)
+        white = self.factor.whiten(cross)
+        shift = (cross.mT @ self.factor.alpha.unsqueeze(-1)).squeeze(-1).unflatten(-1, (-1, count))
+        # `(groups, m, terms, n)`
+        each = white.unflatten(-1, (-1, count)).movedim(-3, -1)
+        known = torch.diag_embed(own) - each @ each.mT
+        rest = loading - each @ self.white_loading.unsqueeze(-3)
+        covariance = known + rest @ self.level_covariance.unsqueeze(-3) @ rest.mT
+        variance = known.diagonal(dim1=-2, dim2=-1).clamp_min(0.0)
+        location = unwarped(before + shift, before.expand(shape), variance, own)
+        return location, covariance, shown.reshape(-1).expand(shape), prior_covariance
+
+    def _level_loading(self, x: Tensor) -> Tensor:
+        """Derivative of E[u] by the logarithms of levels and couplings of K, D and M, `(groups, n · axes, 3 terms)`."""
+        columns = []
+        for order, process in enumerate(self.kernel.impedance.processes):
+            # `(axes, terms, groups, n)` to `(groups, n · axes, terms)`
+            by_term = self.kernel.impedance.loading(x, order)[..., 0].movedim(1, -1).movedim(0, -2)
+            columns.append(by_term.flatten(-3, -2) @ process.offsets)
+        return torch.cat(columns, dim=-1)
+
+
+def _level_variance(model: ForceModel, latent: Latent) -> Tensor:
+    """Variance of the logarithms of levels and couplings of one impedance, `(terms,)`."""
+    parts = []
+    for name in ("level", "coupling"):
+        entry = entry_of(model, f"{latent.value}.{name}")
+        spec = entry.specs[0]
+        parts.append(
+            torch.full((entry.raw.numel(),), 0.0 if spec.fixed else spec.log_sd**2, dtype=torch.float64)
+        )
+    return torch.cat(parts)
+
+
+def _median_levels(model: ForceModel, process: CoupledProcess, latent: Latent) -> Tensor:
+    """Levels of the terms before training [unit of W]."""
+    level, coupling = (entry_of(model, f"{latent.value}.{name}").medians for name in ("level", "coupling"))
+    return process.levels_of(level.expand_as(process.level), coupling.expand_as(process.coupling))
+
+
+def _joined_pieces(pieces: Sequence[tuple[Tensor, Tensor, Tensor, Tensor]], dim: int) -> Moments:
+    a, b, c, d = zip(*pieces, strict=True)
+    return torch.cat(a, dim), torch.cat(b, dim), torch.cat(c, dim), torch.cat(d, dim)
