@@ -122,6 +122,16 @@ ENGINES = (
     "engines.pointwise",
     "engines.given_impedance",
     "engines.given_dense",
+    "engines.lowrank.basis",
+    "engines.lowrank.hilbert",
+    "engines.lowrank.periodic",
+    "engines.lowrank.blocks",
+    "engines.lowrank.columns",
+    "engines.lowrank.woodbury",
+    "engines.lowrank.support",
+    "engines.lowrank.prediction",
+    "engines.lowrank.engine",
+    "engines.lowrank",
     "engines",
 )
 COMMANDS = (
