@@ -34,9 +34,9 @@ RECOMPUTED = 1_000_000
 class LowRankEngine:
     """Exact inference given impedance for processes that are sums of features.
 
-    What features leave out of the kernels' derivatives is all that separates it from the dense engine; `accuracy` says how
-    much that is (None: see `chosen`). Features that a trial has of its own are eliminated trial by trial, then those that
-    its group shares. Length scales change the number of features in steps, which is not differentiated.
+    What features leave out of the kernels' derivatives is all that separates it from the dense engine; `accuracy` says
+    how much that is (None: see `chosen`). Features that a trial has of its own are eliminated trial by trial, then
+    those that its group shares. Length scales change the number of features in steps, which are not differentiated.
     """
 
     def __init__(self, features: Features, coupled: bool, accuracy: Accuracy | None = None) -> None:

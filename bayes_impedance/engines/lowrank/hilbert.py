@@ -27,9 +27,9 @@ RADIUS = 1.1
 class Accuracy:
     """How far features reach: L = S + `margin` · ℓ about a range of half-width S, frequencies up to `cutoff` / ℓ.
 
-    The error of ∂_tⁱ ∂_t'ʲ k along a scalar θ, relative to the largest ∂_t² ∂_t'² k: 1.5e-3 with (2.5, 4.5), 2.2e-5 with
-    (3, 5.5), 1e-7 with (3.5, 6.5), 1e-10 with (4, 7.5); of k itself a hundredth of that. What this does to a likelihood
-    grows with (prior SD of force / SD of noise)² and the number of samples.
+    The error of ∂_tⁱ ∂_t'ʲ k along a scalar θ, relative to its largest value: for i = j = 2 at most 1.5e-3 with
+    (2.5, 4.5), 2.2e-5 with (3, 5.5), 1e-7 with (3.5, 6.5), 1e-10 with (4, 7.5); a hundredth of that for k itself. What
+    this does to a likelihood grows with the samples and with (prior SD of force / SD of noise)².
     """
 
     margin: float

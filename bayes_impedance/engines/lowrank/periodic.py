@@ -33,7 +33,8 @@ def fourier_basis(kernel: StationaryKernel, column: int, axes: int, accuracy: Ac
     # Cosines first, as sines a quarter turn ahead; the sine of frequency zero is left out.
     frequency = 2.0 * math.pi * torch.cat([turns, turns[1:]])
     shift = torch.cat([turns.new_full((count + 1,), 0.5 * math.pi), turns.new_zeros(count)])
-    double = torch.where(frequency > 0, math.sqrt(2.0), 1.0)
+    double = torch.full_like(frequency, math.sqrt(2.0))
+    double[0] = 1.0
     spectrum = torch.exp(-0.25 * (frequency * scale).square()) * scale.sqrt()
     weight = (2.0 * math.pi) ** 0.25 * kernel.sd.expand(axes, 1, 1, 1) * double * spectrum
     return Basis((column,), (Waves(frequency, shift, weight),))

@@ -22,7 +22,7 @@ MAX_TRAJECTORY_DIMS, MAX_RESIDUAL_DIMS = 3, 2
 def unsupported(
     processes: Processes,
     features: Features,
-    coupled: bool,
+    coupled: bool = False,
     accuracy: Accuracy | None = None,
     target: Features | None = None,
 ) -> str | None:
@@ -118,9 +118,9 @@ def _number(
     if largest <= MAX_FEATURES:
         return None
     return (
-        f"expected at most {MAX_FEATURES} features, found that {largest} are needed ({number} of the desired trajectory "
-        f"and {residual} of the residual force{f', for each of {axes} coupled axes' if coupled else ''}) for length "
-        "scales so short beside what the samples cover; expect longer ones, cut the recording, or take "
+        f"expected at most {MAX_FEATURES} features, found that {largest} are needed ({number} of the desired "
+        f"trajectory and {residual} of the residual force{f', for each of {axes} coupled axes' if coupled else ''}) "
+        "for length scales so short beside what the samples cover; expect longer ones, cut the recording, or take "
         "engine.name=dense"
     )
 

@@ -119,8 +119,8 @@ def _cholesky(gram: Tensor) -> Tensor:
     factor, info = torch.linalg.cholesky_ex(gram + torch.eye(size, dtype=gram.dtype))
     if bool(info.any()) or not bool(factor.detach().isfinite().all()):
         raise NotPositiveDefiniteError(
-            f"expected a Cholesky factor of the precision of {size} features, found none, for the noise is negative, not "
-            "finite, or eight orders of magnitude below the forces; raise model.noise_sd"
+            f"expected a Cholesky factor of the precision of {size} features, found none, for the noise is negative, "
+            "not finite, or eight orders of magnitude below the forces; raise model.noise_sd"
         )
     return factor
 
