@@ -1,6 +1,7 @@
 """The low-rank engine against dense covariances, its gradient, and what it refuses."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import gpytorch
 import pytest
@@ -8,9 +9,9 @@ import torch
 
 from bayes_impedance.engines.given_dense import DenseGivenImpedance
 from bayes_impedance.engines.given_impedance import LATENTS, Processes
-from bayes_impedance.engines.lowrank import CHEAP, FINE, TIGHT, Accuracy, LowRankEngine, engine, unsupported
+from bayes_impedance.engines.lowrank import Accuracy, LowRankEngine, engine, unsupported
 from bayes_impedance.engines.lowrank.blocks import LARGEST, batches
-from bayes_impedance.engines.lowrank.hilbert import Extent, counts
+from bayes_impedance.engines.lowrank.hilbert import CHEAP, FINE, TIGHT, Extent, counts
 from bayes_impedance.errors import ConfigurationError, NotPositiveDefiniteError
 from bayes_impedance.kernels.impedance import Latent
 from tests.engines.given import NO_RESIDUAL, given_problem
@@ -120,7 +121,7 @@ def test_dense_likelihood_is_reached_as_features_grow(case, coupled):
         value = lowrank.log_likelihood_given_impedance(given.processes, given.impedance)
         errors.append((value - expected).abs().max().item())
     # Each step of the rule divides the error of the covariance by 70 and more; at one step errors may cancel.
-    assert all(after < before / 5.0 for before, after in zip(errors, errors[1:], strict=False))
+    assert all(after < before / 5.0 for before, after in pairwise(errors))
     assert errors[-1] < 1e-9 * expected.abs().max().item()
 
 
@@ -131,7 +132,9 @@ def test_accuracy_of_the_default(case):
     expected = DenseGivenImpedance(given.features, False).log_likelihood_given_impedance(
         given.processes, given.impedance
     )
-    value = LowRankEngine(given.features, False).log_likelihood_given_impedance(given.processes, given.impedance)
+    value = LowRankEngine(given.features, False).log_likelihood_given_impedance(
+        given.processes, given.impedance
+    )
     # `FINE` over a scalar, `TIGHT` over several components: one to two hundred times less accurate.
     rtol = 1e-5 if len(given.processes.layout.theta) == 1 else 1e-3
     torch.testing.assert_close(value, expected, rtol=rtol, atol=rtol)
@@ -209,7 +212,9 @@ def test_a_step_in_the_number_of_features_hardly_moves_the_likelihood():
 @torch.no_grad()
 def test_samples_may_be_cut_anywhere(monkeypatch):
     given = problem("phase")
-    whole = LowRankEngine(given.features, True).log_likelihood_given_impedance(given.processes, given.impedance)
+    whole = LowRankEngine(given.features, True).log_likelihood_given_impedance(
+        given.processes, given.impedance
+    )
     monkeypatch.setattr("bayes_impedance.engines.lowrank.blocks.LARGEST", 7)
     cut = LowRankEngine(given.features, True).log_likelihood_given_impedance(given.processes, given.impedance)
     torch.testing.assert_close(cut, whole, rtol=1e-9, atol=0)
@@ -328,7 +333,9 @@ def test_too_many_features_are_refused(name, coupled):
 
 
 def test_too_many_features_of_a_periodic_phase_are_refused():
-    given = given_problem("phase", (*PLAIN, "model.desired_trajectory.periodic=true"), repetitions=2, rate=6.0)
+    given = given_problem(
+        "phase", (*PLAIN, "model.desired_trajectory.periodic=true"), repetitions=2, rate=6.0
+    )
     assert unsupported(given.processes, given.features) is None
     given.processes.trajectory.lengthscale = 1e-4
     assert "expected at most 2000 features" in unsupported(given.processes, given.features)

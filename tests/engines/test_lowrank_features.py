@@ -1,13 +1,22 @@
 """Features against the kernels they stand for, and the regression on them against dense matrices."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 
-from bayes_impedance.engines.lowrank import CHEAP, FINE, TIGHT, Accuracy
-from bayes_impedance.engines.lowrank.hilbert import Extent, constant_basis, hilbert_basis
+from bayes_impedance.engines.lowrank.hilbert import (
+    CHEAP,
+    FINE,
+    TIGHT,
+    Accuracy,
+    Extent,
+    constant_basis,
+    hilbert_basis,
+)
 from bayes_impedance.engines.lowrank.periodic import fourier_basis
-from bayes_impedance.engines.lowrank.woodbury import Rows, regress
+from bayes_impedance.engines.lowrank.woodbury import Rows, Source, regress
 from bayes_impedance.kernels.derivative import Path, derivative_table
 from bayes_impedance.kernels.stationary import StationaryKernel
 
@@ -140,7 +149,9 @@ def test_phase_joined_at_its_ends_has_one_variance_everywhere():
     theta = torch.tensor([0.0, 0.01, 0.5, 1.0], dtype=torch.float64).reshape(1, 1, 4, 1).expand(2, 1, 4, 1)
     jet = basis.jet(Path(theta, torch.ones_like(theta), torch.zeros_like(theta)))
     for part in jet:
-        torch.testing.assert_close(part[..., 0, :], part[..., 3, :], rtol=0, atol=1e-12 * part.abs().max().item())
+        torch.testing.assert_close(
+            part[..., 0, :], part[..., 3, :], rtol=0, atol=1e-12 * part.abs().max().item()
+        )
         variance = part.square().sum(-1)
         torch.testing.assert_close(variance, variance[..., :1].expand_as(variance), rtol=1e-9, atol=0)
     # Half a turn is 2.6 length scales of the longer one: the turns hardly overlap.
@@ -170,13 +181,13 @@ def random_rows(seed, sd=0.3, own=3, shared=4):
         if blocks == 2:
             for part in parts:
                 part[:, 1, 4:] = 0.0
-        batches.append(Rows(group, parts[0], parts[1], parts[2][..., 0]))
+        batches.append((group, Rows(parts[0], parts[1], parts[2][..., 0])))
     return batches
 
 
 def stacked(batches, group):
     """The same rows with a column for each feature of each block."""
-    chosen = [rows for rows in batches if rows.group == group]
+    chosen = [rows for of, rows in batches if of == group]
     own = [rows.own[0, b].numpy() for rows in chosen for b in range(rows.own.shape[1])]
     design = np.zeros((sum(map(len, own)), sum(part.shape[1] for part in own)))
     row = column = 0
@@ -189,19 +200,18 @@ def stacked(batches, group):
     )
 
 
+@pytest.mark.parametrize("recompute", [False, True])
 @pytest.mark.parametrize(("own", "shared"), [(3, 4), (0, 4), (3, 0)])
-def test_regression_is_the_dense_quadratic_form_and_determinant(own, shared):
+def test_regression_is_the_dense_quadratic_form_and_determinant(own, shared, recompute):
     batches = random_rows(0, own=own, shared=shared)
-    solution = regress(batches)
+    solution = regress([Source(group, partial(tuple, rows)) for group, rows in batches], recompute)
     for group in range(2):
         design, force = stacked(batches, group)
         covariance = np.eye(len(force)) + design @ design.T
         np.testing.assert_allclose(
             solution.quadratic[0, group], force @ np.linalg.solve(covariance, force), rtol=1e-10
         )
-        np.testing.assert_allclose(
-            solution.log_det[0, group], np.linalg.slogdet(covariance)[1], rtol=1e-12
-        )
+        np.testing.assert_allclose(solution.log_det[0, group], np.linalg.slogdet(covariance)[1], rtol=1e-12)
 
 
 def test_small_noise_loses_no_digits_of_the_quadratic_form():
@@ -212,7 +222,7 @@ def test_small_noise_loses_no_digits_of_the_quadratic_form():
     weights, noise = (torch.randn(size, generator=generator, dtype=torch.float64) for size in (features, n))
     force = design @ weights / sd + noise
     rows = design[None, None] / sd
-    solution = regress([Rows(0, rows[..., :0], rows, force[None, None])])
+    solution = regress([Source(0, lambda: Rows(rows[..., :0], rows, force[None, None]))])
     # Householder's QR of the rows with those of the prior below them, which squares nothing.
     tall = np.concatenate([design.numpy() / sd, np.eye(features)])
     q, r = np.linalg.qr(tall)

@@ -2,8 +2,5 @@
 
 from bayes_impedance.engines.lowrank.columns import Design as Design
 from bayes_impedance.engines.lowrank.engine import LowRankEngine as LowRankEngine
-from bayes_impedance.engines.lowrank.hilbert import CHEAP as CHEAP
-from bayes_impedance.engines.lowrank.hilbert import FINE as FINE
-from bayes_impedance.engines.lowrank.hilbert import TIGHT as TIGHT
 from bayes_impedance.engines.lowrank.hilbert import Accuracy as Accuracy
 from bayes_impedance.engines.lowrank.support import unsupported as unsupported

@@ -62,10 +62,10 @@ class Design:
                 terms.append(_hilbert(term, columns_of(term), logs, rule))
         return cls(processes.layout, coupled, basis, tuple(terms))
 
-    @property
-    def size(self) -> int:
-        """Number of features of an axis, of desired trajectory and residual force together."""
-        return self.basis.size + sum(basis.size for basis in self.residual_bases)
+    def columns(self, axes: int) -> int:
+        """Number of columns, of desired trajectory and residual force together."""
+        size = self.basis.size + sum(basis.size for basis in self.residual_bases)
+        return size * axes if self.coupled else size
 
     def force(self, inputs: Tensor, impedance: Tensor) -> Tensor:
         """Φ with Σ_j W_j f⁽ʲ⁾ = Φ β [N]: row of axis a is Σ_j Σ_c W_j,ac φ_c⁽ʲ⁾.

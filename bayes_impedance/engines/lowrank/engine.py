@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
 from bayes_impedance.engines.given_impedance import (
     MeanAndVariance,
@@ -21,14 +21,14 @@ from bayes_impedance.engines.lowrank.columns import Design
 from bayes_impedance.engines.lowrank.hilbert import Accuracy
 from bayes_impedance.engines.lowrank.prediction import predict
 from bayes_impedance.engines.lowrank.support import own_column, unsupported
-from bayes_impedance.engines.lowrank.woodbury import Rows, Solution, regress
+from bayes_impedance.engines.lowrank.woodbury import Rows, Solution, Source, regress
 from bayes_impedance.errors import ConfigurationError
 from bayes_impedance.features import Features
 from bayes_impedance.kernels.impedance import Latent
 
-#: Numbers in the design matrix beyond which the backward pass computes features again rather than keep what they
-#: were made from, some ten times as much.
-RECOMPUTED = 1_000_000
+#: Numbers in the design matrix beyond which features are made anew, batch by batch, rather than kept: what the backward
+#: pass needs of four million takes some .6 GB. It takes twice the time.
+RECOMPUTED = 4_000_000
 
 
 class LowRankEngine:
@@ -106,27 +106,21 @@ class LowRankEngine:
         assert self.features.force is not None
         misfit = self.features.force - mean_force(processes.layout, self.features, impedance)
         deviation = self._noise(processes).sqrt()
-        sources = self._blocks(processes)
-        samples = sum(batch.index.numel() for batch in sources)
-        large = samples * len(misfit) * design.size > RECOMPUTED
 
-        def rows(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+        def rows(batch: Batch) -> Rows:
             weight = batch.valid / deviation
             x = batch.take(self.features.inputs)
             own, shared = design.split(
-                # (axes, blocks, n) of the rows of W
+                # Rows of W over the σ_r of their axis.
                 design.force(
                     x, impedance[batch.group, batch.index] * weight.permute(1, 2, 0)[:, :, None, :, None]
                 ),
                 design.residual(x) * design.rows(weight.expand(x.shape[:-1])).unsqueeze(-1),
             )
-            return own, shared, design.rows(batch.take(misfit) * weight)
+            return Rows(own, shared, design.rows(batch.take(misfit) * weight))
 
-        parts = []
-        for batch in sources:
-            if large and torch.is_grad_enabled():
-                own, shared, force = checkpoint(rows, batch, use_reentrant=False, preserve_rng_state=False)
-            else:
-                own, shared, force = rows(batch)
-            parts.append(Rows(batch.group, own, shared, force))
-        return regress(parts)
+        blocks = self._blocks(processes)
+        samples = sum(batch.index.numel() for batch in blocks)
+        entries = samples * len(misfit) * design.columns(len(misfit))
+        sources = [Source(batch.group, partial(rows, batch)) for batch in blocks]
+        return regress(sources, recompute=entries > RECOMPUTED)

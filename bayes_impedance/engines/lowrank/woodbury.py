@@ -11,23 +11,32 @@ order; yᵀy − yᵀΦ(…)⁻¹Φᵀy would lose as many digits as yᵀy is la
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from bayes_impedance.errors import NotPositiveDefiniteError
 
 
-@dataclass(frozen=True)
-class Rows:
-    """Whitened rows of some blocks of a group: `own` Ψ `(axes, blocks, n, own features)`, `shared` Φ, `force` y."""
+class Rows(NamedTuple):
+    """Whitened rows of some blocks: `own` Ψ `(axes, blocks, n, own features)`, `shared` Φ, `force` y."""
 
-    group: int
     own: Tensor
     shared: Tensor
     force: Tensor
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where the rows of some blocks of a group come from."""
+
+    group: int
+    rows: Callable[[], Rows]
 
 
 @dataclass(frozen=True)
@@ -50,67 +59,87 @@ class Solution:
     own: tuple[Own, ...]
 
 
-def regress(batches: Sequence[Rows]) -> Solution:
+def regress(sources: Sequence[Source], recompute: bool = False) -> Solution:
     """Eliminate each block's own features, then those that a group shares; groups are 0, 1, … without a gap.
+
+    With `recompute` rows are made anew for each of two passes, and for each of these in the backward pass, so that none
+    but those of one source are held at a time.
 
     Raises:
         NotPositiveDefiniteError: rounding leaves no Cholesky factor.
     """
-    reduced = [_eliminate(rows) for rows in batches]
-    groups = [
-        [reduced[k] for k, rows in enumerate(batches) if rows.group == group]
-        for group in range(1 + max(rows.group for rows in batches))
+    call = _recomputed if recompute else _called
+    reduced = [
+        partial(_eliminate, source.rows) if recompute else partial(_kept, _eliminate(source.rows))
+        for source in sources
     ]
-    factor = _cholesky(torch.stack([_sum([part.gram for part in group]) for group in groups], dim=-3))
-    cross = torch.stack([_sum([part.cross for part in group]) for group in groups], dim=-2)
-    mean = torch.cholesky_solve(cross.unsqueeze(-1), factor)[..., 0]
-    log_det, quadratic = [], []
-    for g, group in enumerate(groups):
-        log_det.append(_sum([part.log_det for part in group]))
-        quadratic.append(_sum([part.quadratic(mean[..., g, :]) for part in group]))
+    moments = [call(partial(_moments, part)) for part in reduced]
+    members = [
+        [k for k, source in enumerate(sources) if source.group == group]
+        for group in range(1 + max(source.group for source in sources))
+    ]
+
+    def add(entry: int) -> list[Tensor]:
+        return [_sum([moments[k][entry] for k in group]) for group in members]
+
+    factor = _cholesky(torch.stack(add(0), dim=-3))
+    mean = torch.cholesky_solve(torch.stack(add(1), dim=-2).unsqueeze(-1), factor)[..., 0]
+    squares = [
+        _sum([call(partial(_squares, reduced[k]), mean[..., g, :]) for k in group])
+        for g, group in enumerate(members)
+    ]
     return Solution(
-        torch.stack(quadratic, dim=-1) + mean.square().sum(-1),
-        torch.stack(log_det, dim=-1) + _log_det(factor),
+        torch.stack(squares, dim=-1) + mean.square().sum(-1),
+        torch.stack(add(2), dim=-1) + _log_det(factor),
         factor,
         mean,
-        tuple(part.own for part in reduced),
+        tuple(Own(*part[3:]) for part in moments),
     )
 
 
-@dataclass(frozen=True)
-class _Reduced:
-    """Rows of β alone, over whose squares the best γ leaves a sum: `shared` Φ̃ `(axes, rows, features)`, `force` ỹ."""
+class _Reduced(NamedTuple):
+    """Rows of β alone, whose squares sum to what the best γ leaves: `shared` Φ̃ `(axes, rows, features)`, `force` ỹ."""
 
     shared: Tensor
     force: Tensor
     own: Own
 
-    @property
-    def gram(self) -> Tensor:
-        return self.shared.mT @ self.shared
 
-    @property
-    def cross(self) -> Tensor:
-        return (self.shared.mT @ self.force.unsqueeze(-1))[..., 0]
-
-    @property
-    def log_det(self) -> Tensor:
-        return _log_det(self.own.factor).sum(-1)
-
-    def quadratic(self, mean: Tensor) -> Tensor:
-        """|ỹ − Φ̃β|² at β `(axes, features)`."""
-        return (self.force - (self.shared @ mean.unsqueeze(-1))[..., 0]).square().sum(-1)
-
-
-def _eliminate(rows: Rows) -> _Reduced:
-    right = torch.cat([rows.shared, rows.force.unsqueeze(-1)], dim=-1) if rows.own.shape[-1] else None
-    factor = _cholesky(rows.own.mT @ rows.own)
-    if right is None:
-        none = rows.own.mT @ rows.shared
-        return _Reduced(rows.shared.flatten(-3, -2), rows.force.flatten(-2), Own(factor, none, none.sum(-1)))
-    fit = torch.cholesky_solve(rows.own.mT @ right, factor)
-    left = torch.cat([right - rows.own @ fit, -fit], dim=-2).flatten(-3, -2)
+def _eliminate(make: Callable[[], Rows]) -> _Reduced:
+    own, shared, force = make()
+    factor = _cholesky(own.mT @ own)
+    if own.shape[-1] == 0:
+        none = own.mT @ shared
+        return _Reduced(shared.flatten(-3, -2), force.flatten(-2), Own(factor, none, none.sum(-1)))
+    right = torch.cat([shared, force.unsqueeze(-1)], dim=-1)
+    fit = torch.cholesky_solve(own.mT @ right, factor)
+    left = torch.cat([right - own @ fit, -fit], dim=-2).flatten(-3, -2)
     return _Reduced(left[..., :-1], left[..., -1], Own(factor, fit[..., :-1], fit[..., -1]))
+
+
+def _moments(part: Callable[[], _Reduced]) -> tuple[Tensor, ...]:
+    """Φ̃ᵀΦ̃, Φ̃ᵀỹ, log det(I + ΨᵀΨ) of all blocks, and what gives γ."""
+    shared, force, own = part()
+    cross = (shared.mT @ force.unsqueeze(-1))[..., 0]
+    return shared.mT @ shared, cross, _log_det(own.factor).sum(-1), own.factor, own.slope, own.offset
+
+
+def _squares(part: Callable[[], _Reduced], mean: Tensor) -> Tensor:
+    """|ỹ − Φ̃β|² at β `(axes, features)`."""
+    shared, force, _ = part()
+    return (force - (shared @ mean.unsqueeze(-1))[..., 0]).square().sum(-1)
+
+
+def _kept(part: _Reduced) -> _Reduced:
+    return part
+
+
+def _called(function: Callable[..., Any], *arguments: Tensor) -> Any:
+    return function(*arguments)
+
+
+def _recomputed(function: Callable[..., Any], *arguments: Tensor) -> Any:
+    return checkpoint(function, *arguments, use_reentrant=False, preserve_rng_state=False)
 
 
 def _cholesky(gram: Tensor) -> Tensor:
