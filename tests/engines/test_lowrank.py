@@ -258,6 +258,46 @@ def test_design_matrices_are_force_and_trajectory_of_the_same_coefficients(coupl
 
 
 @torch.no_grad()
+@pytest.mark.parametrize("coupled", [False, True])
+@pytest.mark.parametrize("case", ["phase", "phase, residual and offset a trial", "phase, shared residual"])
+def test_coefficients_have_the_posterior_of_the_trajectory(case, coupled):
+    given = problem(case, groups=1)
+    lowrank, processes, x = LowRankEngine(given.features, coupled), given.processes, given.features.inputs
+    design, solution = lowrank.coefficients(processes, given.impedance)
+    rows = design.trajectory(x, 0)
+    size = rows.shape[-1]
+    precision = solution.factor @ solution.factor.mT
+    covariance = rows @ torch.linalg.inv(precision)[..., :size, :size] @ rows.mT
+    found = lowrank.posterior(processes, given.impedance, given.features, given.impedance)
+    mean, variance = found[Latent.DESIRED_POSITION]
+    shift = design.rows(mean - given.features.trajectory_mean[..., 0])
+    torch.testing.assert_close((rows @ solution.mean[..., :size, None])[..., 0], shift, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(
+        covariance.diagonal(dim1=-2, dim2=-1), design.rows(variance), rtol=1e-6, atol=1e-14
+    )
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("case", ["phase", "phase, residual and offset a trial", "time"])
+@pytest.mark.parametrize("coupled", [False, True])
+def test_a_group_without_samples_has_its_prior(case, coupled):
+    given = problem(case)
+    valid = valid_rows(given.features).clone()
+    valid[1] = False
+    features = replace(given.features, valid=valid)
+    lowrank, dense = LowRankEngine(features, coupled), DenseGivenImpedance(features, coupled)
+    values = lowrank.log_likelihood_given_impedance(given.processes, given.impedance)
+    assert not values[:, 1].any() and values[:, 0].all()
+    target = replace(given.features, valid=None)
+    found = lowrank.posterior(given.processes, given.impedance, target, given.impedance)
+    expected = dense.posterior(given.processes, given.impedance, target, given.impedance)
+    for latent in LATENTS:
+        (mean, variance), (mean0, variance0) = (result[latent] for result in (found, expected))
+        torch.testing.assert_close(mean[:, 1], mean0[:, 1], rtol=1e-9, atol=1e-12)
+        torch.testing.assert_close(variance[:, 1], variance0[:, 1], rtol=1e-4, atol=1e-12)
+
+
+@torch.no_grad()
 def test_padded_targets_keep_their_prior_mean():
     given = problem("phase")
     found = LowRankEngine(given.features, False).posterior(

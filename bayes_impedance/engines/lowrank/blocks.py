@@ -56,7 +56,7 @@ def batches(features: Features, column: int | None) -> tuple[Batch, ...]:
 def _blocks(features: Features, column: int | None, group: int) -> Iterator[tuple[float, Tensor]]:
     n = features.inputs.shape[2]
     rows = torch.arange(n) if features.valid is None else features.valid[group].nonzero()[:, 0]
-    if column is None:
+    if column is None or not len(rows):
         for part in rows.split(LARGEST):
             yield 0.0, part
         return

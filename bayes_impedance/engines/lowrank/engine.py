@@ -50,8 +50,7 @@ class LowRankEngine:
             ConfigurationError: processes that features cannot hold, see `unsupported`.
             NotPositiveDefiniteError: rounding leaves no Cholesky factor.
         """
-        design = self.design(processes)
-        solution = self._solve(processes, design, self._known(impedance))
+        _, solution = self.coefficients(processes, impedance)
         # Rows were divided by σ_r, so its log det is that of every sample.
         noise = (self._noise(processes)[..., 0].log() + math.log(2.0 * math.pi)) * self._count()
         return -0.5 * (solution.quadratic + solution.log_det + sum_over_axes(noise, self.coupled))
@@ -66,8 +65,7 @@ class LowRankEngine:
             NotPositiveDefiniteError: rounding leaves no Cholesky factor.
         """
         with torch.no_grad():
-            design = self.design(processes, target)
-            solution = self._solve(processes, design, self._known(impedance))
+            design, solution = self.coefficients(processes, impedance, target)
             sources = self._blocks(processes)
             return predict(
                 design, solution, sources, target, self._known(target_impedance), own_column(processes)
@@ -84,6 +82,21 @@ class LowRankEngine:
             raise ConfigurationError(f"the low-rank engine cannot hold this model: {reason}")
         logs = [self.features] if target is None else [self.features, target]
         return Design.of(processes, logs, self.coupled, self.accuracy)
+
+    def coefficients(
+        self, processes: Processes, impedance: Tensor, target: Features | None = None
+    ) -> tuple[Design, Solution]:
+        """The design and the posterior of its coefficients given impedance, from which x_d can be drawn as a function.
+
+        Coefficients β that a group shares are those of `design.trajectory`, then of `design.residual`, as far as shared:
+        β = `mean` + `factor`⁻ᵀ z with z ~ N(0, I), one for each group and, where axes do not couple, axis.
+
+        Raises:
+            ConfigurationError: processes that features cannot hold, see `unsupported`.
+            NotPositiveDefiniteError: rounding leaves no Cholesky factor.
+        """
+        design = self.design(processes, target)
+        return design, self._solve(processes, design, self._known(impedance))
 
     def _known(self, impedance: Tensor) -> Tensor:
         return impedance if self.coupled else diagonal_only(impedance)
