@@ -88,8 +88,8 @@ class LowRankEngine:
     ) -> tuple[Design, Solution]:
         """The design and the posterior of its coefficients given impedance, from which x_d can be drawn as a function.
 
-        Coefficients β that a group shares are those of `design.trajectory`, then of `design.residual`, as far as shared:
-        β = `mean` + `factor`⁻ᵀ z with z ~ N(0, I), one for each group and, where axes do not couple, axis.
+        Columns of `design.trajectory`, then of `design.residual`, as far as a group shares them, have coefficients
+        β = `mean` + `factor`⁻ᵀ z, z ~ N(0, I), one vector for each group and, where axes do not couple, each axis.
 
         Raises:
             ConfigurationError: processes that features cannot hold, see `unsupported`.
