@@ -13,11 +13,18 @@ import torch
 
 from bayes_impedance.config import Config, load_config
 from bayes_impedance.device import follow_law
+from bayes_impedance.engines.choice import MOMENTS, EngineChoice
 from bayes_impedance.engines.dense import Observations, check_capacity
 from bayes_impedance.engines.pointwise import PointPredictor
 from bayes_impedance.errors import ConfigurationError, LogError
 from bayes_impedance.features import FeatureMap, check_combination, count_repetitions, label_trials, trial_key
 from bayes_impedance.identifiability import Verdict, assess, was_perturbed
+from bayes_impedance.impedance_functions.posterior import (
+    compute_function_posterior,
+    condition,
+    function_evidence,
+)
+from bayes_impedance.impedance_functions.train import FittedFunctions, train_functions
 from bayes_impedance.journal import Journal
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.log import InteractionLog
@@ -33,11 +40,15 @@ Given = Literal["both", "training", "log"]
 
 @dataclass(frozen=True)
 class Fit:
-    """What a model knows after training: hyperparameters, the prepared log that gave them, and how."""
+    """What a model knows after training: hyperparameters, the prepared log that gave them, and how.
+
+    And the functions, where impedance is one (`engine.impedance: map`).
+    """
 
     force_model: ForceModel
     log: PreparedLog
     report: TrainingReport
+    functions: FittedFunctions | None = None
 
 
 class ImpedanceModel:
@@ -91,7 +102,10 @@ class ImpedanceModel:
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """What has a likelihood of its own, in the order of the report: each axis, or "xy" where they are coupled."""
+        """What has a likelihood of its own, in the order of the report: each axis, or all, "xy".
+
+        They have one together where they are coupled, or impedance is a function.
+        """
         return self._parts(self.fitted.log.axes)
 
     @property
@@ -136,8 +150,11 @@ class ImpedanceModel:
         features = feature_map(prepared, self._mean(prepared), observed=True)
         if features.force is None:
             raise LogError("expected a log with force to train on, found none; name log.columns.force")
-        self._check_capacity(prepared)
         force_model = build_force_model(self.config, feature_map)
+        if self._is_function:
+            functions, report = train_functions(self.config, force_model, features, progress)
+            return ImpedanceModel(self.config, Fit(force_model, prepared, report, functions))
+        self._check_capacity(prepared)
         if start is not None:
             force_model.start_at(start.hyperparameters)
         if journal is not None:
@@ -170,6 +187,8 @@ class ImpedanceModel:
         """
         prepared = self.prepare(log)
         evidence = self._evidence(prepared, given)
+        if self._is_function:
+            return self._function_posterior(prepared, evidence, latents)
         feature_map = FeatureMap(self.config, prepared.axes)
         mean = self._mean(prepared)
         conditions = None
@@ -196,6 +215,11 @@ class ImpedanceModel:
             ConfigurationError: the model is not fitted, knows no such axis or group, or its axes are coupled.
         """
         log = self.fitted.log
+        if self._is_function:
+            raise ConfigurationError(
+                "expected engine.impedance: moments to predict one sample at a time, got map; call posterior(log, "
+                "latents=[Latent.FORCE])"
+            )
         if self.config.model.axes == "coupled":
             raise ConfigurationError(
                 "expected model.axes: independent to predict one sample of one axis at a time, got coupled; call "
@@ -220,18 +244,21 @@ class ImpedanceModel:
     def log_marginal_likelihood(self, log: InteractionLog | PreparedLog) -> dict[str, float]:
         """log p(force of `log`) at the model's hyperparameters, by axis, summed over groups [nats].
 
-        Coupled axes have one, under their joined names: "xy".
+        Coupled axes have one, under their joined names: "xy"; so have functions, integrated out by Laplace's method.
 
         Raises:
             LogError, ConfigurationError, TooManySamplesError, NotPositiveDefiniteError.
         """
         prepared = self.prepare(log)
-        self._check_capacity(prepared)
         feature_map = FeatureMap(self.config, prepared.axes)
         features = feature_map(prepared, self._mean(prepared), observed=True)
         if features.force is None:
             raise LogError("expected a log with force, found none; name log.columns.force")
         model = self._force_model(feature_map)
+        if self._is_function:
+            value = function_evidence(self.config, model, self._functions, features)
+            return {self._parts(prepared.axes)[0]: value}
+        self._check_capacity(prepared)
         with torch.no_grad():
             value = log_evidence(model, features, self.config.engine.jitter)
         return dict(zip(self._parts(prepared.axes), value.tolist(), strict=True))
@@ -256,8 +283,51 @@ class ImpedanceModel:
         """The gpytorch kernel, mean and likelihood underneath, to take into one's own code."""
         return self._force_model(FeatureMap(self.config, axes))
 
+    @property
+    def engine(self) -> EngineChoice:
+        """The engine that computes the likelihood, and why it.
+
+        Raises:
+            ConfigurationError: impedance is a function, and the model is not fitted: the log decides.
+        """
+        if not self._is_function:
+            return EngineChoice("dense", MOMENTS)
+        return self._functions.engine
+
+    @property
+    def _functions(self) -> FittedFunctions:
+        functions = self.fitted.functions
+        assert functions is not None
+        return functions
+
+    @property
+    def _is_function(self) -> bool:
+        return self.config.engine.impedance == "map"
+
+    def _function_posterior(
+        self, log: PreparedLog, evidence: PreparedLog | None, latents: Sequence[Latent] | None
+    ) -> Posterior:
+        functions = self._functions
+        feature_map = FeatureMap(self.config, log.axes)
+        mean = self._mean(log)
+        labels = label_trials(*([log] if evidence is None else [log, evidence]))
+        model = self._force_model(feature_map)
+        conditioned = None
+        if evidence is not None:
+            given = feature_map(evidence, mean, labels, observed=True)
+            conditioned = condition(self.config, model, functions, given, self._is_training(evidence))
+        target = feature_map(log, mean, labels)
+        return compute_function_posterior(self.config, model, functions, log, target, conditioned, latents)
+
+    def _is_training(self, evidence: PreparedLog) -> bool:
+        """Whether these are all the forces of some of the groups that the model was trained on."""
+        groups = set(evidence.groups)
+        trained = [trial_key(trial) for trial in self.fitted.log.trials if trial.group in groups]
+        return sorted(trained) == sorted(trial_key(trial) for trial in evidence.trials)
+
     def _parts(self, axes: tuple[str, ...]) -> tuple[str, ...]:
-        return ("".join(axes),) if self.config.model.axes == "coupled" else axes
+        joint = self.config.model.axes == "coupled" or self._is_function
+        return ("".join(axes),) if joint else axes
 
     def _prepared(self, log: InteractionLog) -> PreparedLog:
         # Phase means the same in every log only if all are aligned to the repetition that the training log was.

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import pandas as pd
@@ -116,6 +116,13 @@ class Marginal:
         return np.asarray(np.exp(value) if self.warped else value)
 
 
+class MatrixLaw(Protocol):
+    """Joint law of the entries of K, D or M at each sample."""
+
+    def draw(self, draws: int, generator: np.random.Generator, prior: bool = False) -> Array:
+        """Matrices, `(draws, samples, axes, axes)` [unit of the matrix]; samples are drawn each on its own."""
+
+
 @dataclass(frozen=True)
 class Posterior:
     """Posteriors of the latents at every sample of a log; immutable.
@@ -128,7 +135,7 @@ class Posterior:
     log: PreparedLog
     marginals: Mapping[Latent, Marginal]
     couplings: Mapping[Latent, Marginal] = field(default_factory=dict)
-    terms: Mapping[Latent, LogTerms] = field(default_factory=dict)
+    terms: Mapping[Latent, MatrixLaw] = field(default_factory=dict)
 
     def __getitem__(self, latent: Latent | str) -> Marginal:
         """Marginal of a latent, by member of `Latent` or by name ("stiffness")."""
@@ -237,8 +244,8 @@ def compute_posterior(
             conditioner = _Conditioner(model, select_groups(given, known), jitter)
             parts.append((known, conditioner.moments(select_groups(target, known), latents)))
         if unknown:
-            parts.append((unknown, _prior_only(model, select_groups(target, unknown), latents)))
-    return Posterior(log, {latent: _marginal(model, log, target, latent, parts) for latent in latents})
+            parts.append((unknown, prior_only(model, select_groups(target, unknown), latents)))
+    return Posterior(log, {latent: marginal_of(model, log, target, latent, parts) for latent in latents})
 
 
 def _coupled_posterior(
@@ -258,10 +265,10 @@ def _coupled_posterior(
     marginals, couplings, matrices = {}, {}, {}
     for latent in latents:
         if latent not in IMPEDANCE_ORDER:
-            marginals[latent] = _marginal(model, log, target, latent, parts)
+            marginals[latent] = marginal_of(model, log, target, latent, parts)
             continue
         listed = [
-            _by_sample(log, target, [(chosen, found[latent][i]) for chosen, found in terms]) for i in range(4)
+            by_sample(log, target, [(chosen, found[latent][i]) for chosen, found in terms]) for i in range(4)
         ]
         matrices[latent] = LogTerms(len(log.axes), *listed)
         marginals[latent], couplings[latent] = matrix_marginals(latent, matrices[latent])
@@ -342,7 +349,8 @@ def _is_warped(model: ForceModel, latent: Latent) -> bool:
     return process.law == "log_gaussian"
 
 
-def _prior_only(model: ForceModel, target: Features, latents: Sequence[Latent]) -> dict[Latent, Moments]:
+def prior_only(model: ForceModel, target: Features, latents: Sequence[Latent]) -> dict[Latent, Moments]:
+    """Moments of latents at the samples of `target` before any force."""
     result = {}
     shape = target.inputs.shape[:-1]
     for latent in latents:
@@ -430,19 +438,19 @@ def _level_loading(model: ForceModel, inputs: Tensor, latent: Latent) -> Tensor:
     return loading
 
 
-def _marginal(
+def marginal_of(
     model: ForceModel, log: PreparedLog, target: Features, latent: Latent,
     parts: Sequence[tuple[list[str], dict[Latent, Moments]]],
 ) -> Marginal:  # fmt: skip
     """Undo the batching: rows of groups back to samples of trials."""
     # `(groups, m, axes, 4)`
     batches = [(groups, torch.stack(moments[latent]).permute(2, 3, 1, 0)) for groups, moments in parts]
-    location, variance, prior_location, prior_variance = np.moveaxis(_by_sample(log, target, batches), -1, 0)
+    location, variance, prior_location, prior_variance = np.moveaxis(by_sample(log, target, batches), -1, 0)
     warped = _is_warped(model, latent)
     return Marginal(latent, warped, location, np.sqrt(variance), prior_location, np.sqrt(prior_variance))
 
 
-def _by_sample(log: PreparedLog, target: Features, batches: Sequence[tuple[list[str], Tensor]]) -> Array:
+def by_sample(log: PreparedLog, target: Features, batches: Sequence[tuple[list[str], Tensor]]) -> Array:
     """Values `(groups, m, …)` of batches of groups as `(samples, …)`, in the order of the log's trials."""
     starts = np.cumsum([0, *(len(trial.time) for trial in log.trials)])
     values = np.empty((starts[-1], *batches[0][1].shape[2:]))

@@ -131,10 +131,22 @@ ENGINES = (
     "engines.markov.observation",
     "engines.markov.engine",
     "engines.markov",
+    "engines.lowrank.basis",
+    "engines.lowrank.hilbert",
+    "engines.lowrank.periodic",
+    "engines.lowrank.blocks",
+    "engines.lowrank.columns",
+    "engines.lowrank.woodbury",
+    "engines.lowrank.support",
+    "engines.lowrank.prediction",
+    "engines.lowrank.engine",
+    "engines.lowrank",
+    "engines.choice",
     "engines",
 )
 IMPEDANCE_FUNCTIONS = (
     "impedance_functions.symmetric",
+    "impedance_functions.log_matrix",
     "impedance_functions.inducing",
     "impedance_functions.function",
     "impedance_functions.density",
@@ -144,6 +156,8 @@ IMPEDANCE_FUNCTIONS = (
     "impedance_functions.conditioned",
     "impedance_functions",
 )
+#: Training and posteriors of functions give what training and posteriors of moments give.
+FITTED_FUNCTIONS = ("impedance_functions.train", "impedance_functions.posterior")
 COMMANDS = (
     "commands.inspection_tables",
     "commands.inspect",
@@ -172,6 +186,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             {"conditioning"},
             {"coupled_posterior"},
             {"posterior"},
+            set(FITTED_FUNCTIONS),
             {
                 "identifiability",
                 "evaluation.explained",
@@ -202,6 +217,7 @@ FAMILIES = (
     KERNELS,
     ENGINES,
     IMPEDANCE_FUNCTIONS,
+    FITTED_FUNCTIONS,
     BASELINES,
     SIMULATION,
     COMMANDS,

@@ -135,7 +135,20 @@ class Density:
         return value + log_jacobian(loop, known, self.features.valid, self.coupled)
 
     def __call__(self, point: Array) -> tuple[float, Array]:
-        """Log density, tilted, and its gradient.
+        """`joint` with its tilt, and its gradient.
+
+        Raises:
+            NotPositiveDefiniteError: it is not finite there.
+        """
+        value, gradient = self.joint(point)
+        away = np.zeros_like(point)
+        if self.anchor is not None:
+            away[self.weight_count :] = (point - self.anchor)[self.weight_count :]
+        tilted = value + float(self.tilt @ point) - 0.5 * float(away @ away)
+        return tilted, (gradient + self.tilt - away) * self.free
+
+    def joint(self, point: Array) -> tuple[float, Array]:
+        """Log density of forces, weights and hyperparameters, without constants of the priors, and its gradient.
 
         Raises:
             NotPositiveDefiniteError: it is not finite there.
@@ -145,9 +158,7 @@ class Density:
             entry.raw.grad = None
         free = torch.from_numpy(point[: self.weight_count]).requires_grad_()
         value = self.likelihood(self.designs.matrices(self.weights(free))).sum()
-        value = value - 0.5 * free.square().sum()
-        for entry in self.entries:
-            value = value + log_hyperprior(entry)
+        value = value - 0.5 * free.square().sum() + self.log_hyperpriors()
         value.backward()
         parts = [free, *(entry.raw for entry in self.entries)]
         gradient = np.concatenate(
@@ -158,11 +169,14 @@ class Density:
                 "expected a finite likelihood of the forces given impedance, found one that overflows, or its gradient "
                 "does; check log.units, and that the medians under model are of the size that their unit lets expect"
             )
-        away = np.zeros_like(point)
-        if self.anchor is not None:
-            away[self.weight_count :] = (point - self.anchor)[self.weight_count :]
-        tilted = float(value.detach()) + float(self.tilt @ point) - 0.5 * float(away @ away)
-        return tilted, (gradient + self.tilt - away) * self.free
+        return float(value.detach()), gradient
+
+    def log_hyperpriors(self) -> Tensor:
+        """Log density of the hyperparameters beside impedance, without constants [nats]."""
+        total = torch.zeros((), dtype=torch.float64)
+        for entry in self.entries:
+            total = total + log_hyperprior(entry)
+        return total
 
 
 def log_hyperprior(entry: Entry) -> Tensor:

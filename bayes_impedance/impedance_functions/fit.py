@@ -29,10 +29,14 @@ RELATIVE_TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class Mode:
-    """A maximum of a `Density`: `point` `(size,)`, its log density and the covariance `(free, free)` about it."""
+    """A maximum of a `Density`: `point` `(size,)` and the covariance `(free, free)` of its free coordinates about it.
+
+    `log_evidence` of the forces, the functions integrated out by Laplace's method, with the hyperparameters'
+    log density in it [nats].
+    """
 
     point: Array
-    log_density: float
+    log_evidence: float
     covariance: Array
     iterations: int
     evaluations: int
@@ -64,9 +68,28 @@ def find_mode(
         precision = _precision(density, point)
         if max(moved, np.max(np.abs(point[density.weight_count :] - before), initial=0.0)) < SETTLED:
             break
-    log_density, _ = density(point)
+    return _mode(density, point, precision, climb)
+
+
+def find_weights(density: Density, start: Array, max_iterations: int, gradient_tolerance: float) -> Mode:
+    """Climb from `start` over the weights alone, at its hyperparameters.
+
+    Raises:
+        NotPositiveDefiniteError: the likelihood is not finite somewhere on the way.
+    """
+    density.free[density.weight_count :] = False
+    climb = _Climb(density, gradient_tolerance, None)
+    point = climb(start, None, min(FIRST, max_iterations))
+    point = climb(point, _precision(density, point), max_iterations)
+    return _mode(density, point, _precision(density, point), climb)
+
+
+def _mode(density: Density, point: Array, precision: Array, climb: _Climb) -> Mode:
+    joint, _ = density.joint(point)
+    count = density.weight_count
+    evidence = joint - 0.5 * laplace.log_determinant(precision[:count, :count])
     return Mode(
-        point, log_density, laplace.covariance(precision), climb.iterations, climb.evaluations, climb.outcome
+        point, evidence, laplace.covariance(precision), climb.iterations, climb.evaluations, climb.outcome
     )
 
 
@@ -86,9 +109,9 @@ class _Climb:
 
     def __call__(self, start: Array, precision: Array | None, max_iterations: int) -> Array:
         places = np.flatnonzero(self.density.free)
-        root: Array = np.eye(len(places), dtype=np.float64)
-        if precision is not None:
-            root = np.linalg.cholesky(laplace.covariance(precision))
+        root: Array = np.asarray(
+            np.eye(len(places)) if precision is None else np.linalg.cholesky(laplace.covariance(precision))
+        )
         best = -np.inf
 
         def at(step: Array) -> Array:

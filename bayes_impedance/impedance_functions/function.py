@@ -83,6 +83,13 @@ class ImpedanceFunction:
         carried = design[..., 1:].square().sum(-1)
         return (self.scale.square()[:, None] * own - carried).clamp_min(0.0)
 
+    def prior(self, inputs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Location and covariance of S before any force, `(groups, n, entries)` and `(…, entries)`, given twice."""
+        design = self.design(inputs)
+        variance = (design.square().sum(-1) + self.left_out(inputs, design)).transpose(1, 2)
+        location, covariance = self.location.expand_as(variance), torch.diag_embed(variance)
+        return location, covariance, location, covariance
+
     def logarithm(self, design: Tensor, weights: Tensor) -> Tensor:
         """Entries of S, `(groups, n, entries)`, for `weights` `(groups, entries, width)`."""
         return self.location + torch.einsum("genw,gew->gne", design, weights)

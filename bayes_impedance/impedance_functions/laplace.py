@@ -32,3 +32,8 @@ def covariance(hessian: Array) -> Array:
     values, vectors = np.linalg.eigh(hessian)
     safe = np.where(values > LEAST_CURVATURE * max(values.max(initial=0.0), 1.0), values, 1.0)
     return np.asarray((vectors / safe) @ vectors.T)
+
+
+def log_determinant(hessian: Array) -> float:
+    """log det of the precision of whitened variables: no eigenvalue is below that of the prior, 1, but by rounding."""
+    return float(np.log(np.maximum(np.linalg.eigvalsh(hessian), 1.0)).sum())

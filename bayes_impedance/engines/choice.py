@@ -1,0 +1,104 @@
+"""Which engine computes the likelihood given impedance, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from bayes_impedance.config import EngineConfig
+from bayes_impedance.engines import lowrank, markov
+from bayes_impedance.engines.dense import check_capacity
+from bayes_impedance.engines.given_dense import DenseGivenImpedance
+from bayes_impedance.engines.given_impedance import ConditionalEngine, Processes
+from bayes_impedance.errors import ConfigurationError
+from bayes_impedance.features import Features
+
+MOMENTS = "stiffness, damping and mass are integrated out, which only dense covariances do"
+
+
+@dataclass(frozen=True)
+class EngineChoice:
+    """An engine by `name`, and the `reason` for it, a sentence without its full stop.
+
+    Example:
+        >>> print(EngineChoice("dense", "asked for by engine.name"))
+        engine dense: asked for by engine.name
+    """
+
+    name: str
+    reason: str
+
+    def __str__(self) -> str:
+        """Both, for people."""
+        return f"engine {self.name}: {self.reason}"
+
+
+def choose_engine(
+    config: EngineConfig, processes: Processes, features: Features, coupled: bool
+) -> EngineChoice:
+    """The engine asked for, or the cheapest that is exact and holds the processes: Markov, then dense, then low-rank.
+
+    Raises:
+        ConfigurationError: the engine asked for cannot hold them, or none can.
+        TooManySamplesError: dense is asked for, and the samples are too many.
+    """
+    if config.name == "dense":
+        _check_dense(config, processes, features, coupled)
+    if config.name in ("markov", "lowrank"):
+        refusal = _refusal(config.name, processes, features, coupled)
+        if refusal is not None:
+            raise ConfigurationError(refusal)
+    if config.name != "auto":
+        return EngineChoice(config.name, "asked for by engine.name")
+    not_markov = _refusal("markov", processes, features, coupled)
+    if not_markov is None:
+        return EngineChoice("markov", "exact, at a cost that grows with the number of samples")
+    size = _largest(features, coupled)
+    if size <= config.max_samples and not processes.periodic:
+        return EngineChoice(
+            "dense", f"exact for any process, and {size} forces are few; not markov: {not_markov}"
+        )
+    not_lowrank = _refusal("lowrank", processes, features, coupled)
+    if not_lowrank is None:
+        return EngineChoice("lowrank", f"features stand for the processes; not markov: {not_markov}")
+    raise ConfigurationError(
+        f"engine.name: expected processes that one of the engines holds, found {size} forces in a group, with dense "
+        f"for at most engine.max_samples = {config.max_samples} and no periodic phase; not markov: {not_markov}; "
+        f"not lowrank: {not_lowrank}"
+    )
+
+
+def build_engine(
+    name: str, config: EngineConfig, processes: Processes, features: Features, coupled: bool
+) -> ConditionalEngine:
+    """The engine of that name for the samples of `features`.
+
+    Raises:
+        ConfigurationError: it cannot hold the processes.
+    """
+    if name == "markov":
+        return markov.MarkovEngine(features, processes, coupled)
+    if name == "lowrank":
+        return lowrank.LowRankEngine(features, coupled)
+    return DenseGivenImpedance(features, coupled, config.jitter)
+
+
+def _refusal(name: str, processes: Processes, features: Features, coupled: bool) -> str | None:
+    if name == "markov":
+        return markov.unsupported(processes, features, coupled)
+    return lowrank.unsupported(processes, features, coupled)
+
+
+def _check_dense(config: EngineConfig, processes: Processes, features: Features, coupled: bool) -> None:
+    if processes.periodic:
+        raise ConfigurationError(
+            "engine.name: expected lowrank with model.desired_trajectory.periodic, which joins the ends of the phase "
+            "by Fourier features, got dense; set engine.name=lowrank"
+        )
+    size = _largest(features, coupled)
+    check_capacity(size, config.max_samples, "impedance: map")
+
+
+def _largest(features: Features, coupled: bool) -> int:
+    """Forces of the largest covariance."""
+    n: int = features.inputs.shape[-2]
+    return n * features.inputs.shape[0] if coupled else n

@@ -1,0 +1,139 @@
+"""The low-rank engine: exact inference given impedance on features of the processes, n · features²."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from bayes_impedance.engines.given_impedance import (
+    MeanAndVariance,
+    Processes,
+    diagonal_only,
+    mean_force,
+    sum_over_axes,
+)
+from bayes_impedance.engines.lowrank.blocks import Batch, batches
+from bayes_impedance.engines.lowrank.columns import Design
+from bayes_impedance.engines.lowrank.hilbert import Accuracy
+from bayes_impedance.engines.lowrank.prediction import predict
+from bayes_impedance.engines.lowrank.support import own_column, unsupported
+from bayes_impedance.engines.lowrank.woodbury import Rows, Solution, Source, regress
+from bayes_impedance.errors import ConfigurationError
+from bayes_impedance.features import Features
+from bayes_impedance.kernels.impedance import Latent
+
+#: Numbers in the design matrix beyond which features are made anew, batch by batch, rather than kept: what the backward
+#: pass needs of four million takes some .6 GB. It takes twice the time.
+RECOMPUTED = 4_000_000
+
+
+class LowRankEngine:
+    """Exact inference given impedance for processes that are sums of features.
+
+    What features leave out of the kernels' derivatives is all that separates it from the dense engine; `accuracy` says
+    how much that is (None: see `chosen`). Features that a trial has of its own are eliminated trial by trial, then
+    those that its group shares. Length scales change the number of features in steps, which are not differentiated.
+    """
+
+    def __init__(self, features: Features, coupled: bool, accuracy: Accuracy | None = None) -> None:
+        self.features, self.coupled, self.accuracy = features, coupled, accuracy
+        self._batches: dict[int | None, tuple[Batch, ...]] = {}
+
+    def log_likelihood_given_impedance(self, processes: Processes, impedance: Tensor) -> Tensor:
+        """See `ConditionalEngine`.
+
+        Raises:
+            ConfigurationError: processes that features cannot hold, see `unsupported`.
+            NotPositiveDefiniteError: rounding leaves no Cholesky factor.
+        """
+        _, solution = self.coefficients(processes, impedance)
+        # Rows were divided by σ_r, so its log det is that of every sample.
+        noise = (self._noise(processes)[..., 0].log() + math.log(2.0 * math.pi)) * self._count()
+        return -0.5 * (solution.quadratic + solution.log_det + sum_over_axes(noise, self.coupled))
+
+    def posterior(
+        self, processes: Processes, impedance: Tensor, target: Features, target_impedance: Tensor
+    ) -> Mapping[Latent, MeanAndVariance]:
+        """See `ConditionalEngine`; features are those that hold at `target`, too, however far it is.
+
+        Raises:
+            ConfigurationError: processes that features cannot hold, see `unsupported`.
+            NotPositiveDefiniteError: rounding leaves no Cholesky factor.
+        """
+        with torch.no_grad():
+            design, solution = self.coefficients(processes, impedance, target)
+            sources = self._blocks(processes)
+            return predict(
+                design, solution, sources, target, self._known(target_impedance), own_column(processes)
+            )
+
+    def design(self, processes: Processes, target: Features | None = None) -> Design:
+        """Design matrices that hold at the engine's samples, and at those of `target`.
+
+        Raises:
+            ConfigurationError: processes that features cannot hold, see `unsupported`.
+        """
+        reason = unsupported(processes, self.features, self.coupled, self.accuracy, target)
+        if reason is not None:
+            raise ConfigurationError(f"the low-rank engine cannot hold this model: {reason}")
+        logs = [self.features] if target is None else [self.features, target]
+        return Design.of(processes, logs, self.coupled, self.accuracy)
+
+    def coefficients(
+        self, processes: Processes, impedance: Tensor, target: Features | None = None
+    ) -> tuple[Design, Solution]:
+        """The design and the posterior of its coefficients given impedance, from which x_d can be drawn as a function.
+
+        Columns of `design.trajectory`, then of `design.residual`, as far as a group shares them, have coefficients
+        β = `mean` + `factor`⁻ᵀ z, z ~ N(0, I), one vector for each group and, where axes do not couple, each axis.
+
+        Raises:
+            ConfigurationError: processes that features cannot hold, see `unsupported`.
+            NotPositiveDefiniteError: rounding leaves no Cholesky factor.
+        """
+        design = self.design(processes, target)
+        return design, self._solve(processes, design, self._known(impedance))
+
+    def _known(self, impedance: Tensor) -> Tensor:
+        return impedance if self.coupled else diagonal_only(impedance)
+
+    def _noise(self, processes: Processes) -> Tensor:
+        return processes.noise_variance.expand(self.features.inputs.shape[0], 1, 1)
+
+    def _count(self) -> Tensor:
+        inputs, valid = self.features.inputs, self.features.valid
+        groups, n = inputs.shape[1:3]
+        return inputs.new_full((groups,), n) if valid is None else valid.sum(-1).to(inputs)
+
+    def _blocks(self, processes: Processes) -> tuple[Batch, ...]:
+        column = own_column(processes)
+        if column not in self._batches:
+            self._batches[column] = batches(self.features, column)
+        return self._batches[column]
+
+    def _solve(self, processes: Processes, design: Design, impedance: Tensor) -> Solution:
+        assert self.features.force is not None
+        misfit = self.features.force - mean_force(processes.layout, self.features, impedance)
+        deviation = self._noise(processes).sqrt()
+
+        def rows(batch: Batch) -> Rows:
+            weight = batch.valid / deviation
+            x = batch.take(self.features.inputs)
+            own, shared = design.split(
+                # Rows of W over the σ_r of their axis.
+                design.force(
+                    x, impedance[batch.group, batch.index] * weight.permute(1, 2, 0)[:, :, None, :, None]
+                ),
+                design.residual(x) * design.rows(weight.expand(x.shape[:-1])).unsqueeze(-1),
+            )
+            return Rows(own, shared, design.rows(batch.take(misfit) * weight))
+
+        blocks = self._blocks(processes)
+        samples = sum(batch.index.numel() for batch in blocks)
+        entries = samples * len(misfit) * design.columns(len(misfit))
+        sources = [Source(batch.group, partial(rows, batch)) for batch in blocks]
+        return regress(sources, recompute=entries > RECOMPUTED)

@@ -1,0 +1,137 @@
+"""Posteriors of every latent where impedance is a function."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from bayes_impedance.conditioning import Moments, select_groups
+from bayes_impedance.config import Config
+from bayes_impedance.features import Features
+from bayes_impedance.impedance_functions.conditioned import Conditioned
+from bayes_impedance.impedance_functions.density import Density
+from bayes_impedance.impedance_functions.fit import find_weights
+from bayes_impedance.impedance_functions.function import build_functions
+from bayes_impedance.impedance_functions.log_matrix import LogMatrix
+from bayes_impedance.impedance_functions.train import FittedFunctions, build_density
+from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
+from bayes_impedance.posterior import Marginal, Posterior, by_sample, marginal_of, prior_only
+from bayes_impedance.preprocessing import PreparedLog
+from bayes_impedance.priors import ForceModel
+
+Array = NDArray[np.float64]
+
+
+def condition(
+    config: Config, model: ForceModel, fitted: FittedFunctions, given: Features, trained_on: bool
+) -> Conditioned:
+    """What the forces of `given` tell of the functions, at the hyperparameters that were fitted.
+
+    Where these are forces that the functions were `trained_on`, of some of its groups, that is known already;
+    hyperparameters are then uncertain, too.
+
+    Raises:
+        NotPositiveDefiniteError: the likelihood is not finite.
+        ConfigurationError: the engine cannot hold the processes at these samples.
+    """
+    density = build_density(config, model, given, fitted.inducing, fitted.engine.name)
+    hyperparameters = fitted.point[len(fitted.point) - (len(density.free) - density.weight_count) :]
+    weights = _weights_of(density, fitted)
+    if trained_on:
+        own = np.concatenate(
+            [weights, np.arange(len(fitted.point) - len(hyperparameters), len(fitted.point))]
+        )
+        free = np.concatenate(
+            [np.ones(density.weight_count, dtype=bool), density.free[density.weight_count :]]
+        )
+        place = np.cumsum(_free_of(density, fitted)) - 1
+        kept = place[own[free]]
+        return Conditioned(density, fitted.point[own], fitted.covariance[np.ix_(kept, kept)], free)
+    start = np.concatenate([fitted.point[weights] if len(weights) else density.start()[: density.weight_count],
+                            hyperparameters])  # fmt: skip
+    mode = find_weights(density, start, config.training.max_iterations, config.training.gradient_tolerance)
+    return Conditioned(density, mode.point, mode.covariance, density.free)
+
+
+def compute_function_posterior(
+    config: Config,
+    model: ForceModel,
+    fitted: FittedFunctions,
+    log: PreparedLog,
+    target: Features,
+    conditioned: Conditioned | None,
+    latents: Sequence[Latent] | None = None,
+) -> Posterior:
+    """Posteriors at `target`, the features of `log`; the prior for groups that `conditioned` knows no forces of."""
+    wanted = list(Latent) if latents is None else list(latents)
+    known = (
+        [] if conditioned is None else [g for g in target.groups if g in conditioned.density.features.groups]
+    )
+    unknown = [g for g in target.groups if g not in known]
+    others = [latent for latent in wanted if latent not in IMPEDANCE_ORDER]
+    parts: list[tuple[list[str], dict[Latent, Moments]]] = []
+    logarithms: list[tuple[list[str], list[tuple[torch.Tensor, ...]]]] = []
+    with torch.no_grad():
+        if known:
+            assert conditioned is not None
+            own = select_groups(target, known)
+            parts.append((known, _known_others(model, conditioned, own, others)))
+            logarithms.append((known, [conditioned.logarithm(own, j) for j in range(3)]))
+        if unknown:
+            own = select_groups(target, unknown)
+            parts.append((unknown, prior_only(model, own, others)))
+            functions = build_functions(config, model, fitted.inducing)
+            logarithms.append((unknown, [function.prior(own.inputs) for function in functions]))
+    marginals = {latent: marginal_of(model, log, target, latent, parts) for latent in others}
+    couplings, laws = {}, {}
+    places = build_functions(config, model, fitted.inducing)[0].places
+    for latent in (latent for latent in wanted if latent in IMPEDANCE_ORDER):
+        j = IMPEDANCE_ORDER[latent]
+        listed = [
+            by_sample(log, target, [(chosen, found[j][i]) for chosen, found in logarithms]) for i in range(4)
+        ]
+        law = LogMatrix(places, *listed)
+        laws[latent] = law
+        marginals[latent] = Marginal(latent, True, *law.diagonal(), *law.diagonal(prior=True))
+        if law.is_coupled:
+            couplings[latent] = Marginal(latent, False, *law.beside(), *law.beside(prior=True))
+    return Posterior(log, {latent: marginals[latent] for latent in wanted}, couplings, laws)
+
+
+def _known_others(
+    model: ForceModel, conditioned: Conditioned, target: Features, latents: Sequence[Latent]
+) -> dict[Latent, Moments]:
+    if not latents:
+        return {}
+    found = conditioned.others(target)
+    result = {}
+    for latent, (_, _, prior_location, prior_variance) in prior_only(model, target, latents).items():
+        location, variance = found[latent]
+        if latent is Latent.FORCE:
+            variance = variance + model.noise_variance
+        result[latent] = (location, variance, prior_location, prior_variance)
+    return result
+
+
+def _weights_of(density: Density, fitted: FittedFunctions) -> NDArray[np.int64]:
+    """Where in the fitted point the weights of the density's groups are; none where a group is new."""
+    groups = density.features.groups
+    if any(group not in fitted.groups for group in groups):
+        return np.zeros(0, dtype=np.int64)
+    chosen = [fitted.groups.index(group) for group in groups]
+    start, places = 0, []
+    for _, entries, width in density.shapes:
+        count = len(fitted.groups) * entries * width
+        own = np.arange(start, start + count).reshape(len(fitted.groups), -1)
+        places.append(own[chosen].reshape(-1))
+        start += count
+    return np.concatenate(places)
+
+
+def _free_of(density: Density, fitted: FittedFunctions) -> NDArray[np.bool_]:
+    """Coordinates of the fitted point that were learned: every weight, and the hyperparameters that are not fixed."""
+    hyperparameters = density.free[density.weight_count :]
+    return np.concatenate([np.ones(len(fitted.point) - len(hyperparameters), dtype=bool), hyperparameters])
