@@ -124,6 +124,7 @@ ENGINES = (
     "engines.given_dense",
     "engines.markov.state_space",
     "engines.markov.recursions",
+    "engines.markov.reverse",
     "engines.markov.arrangement",
     "engines.markov.likelihood",
     "engines.markov.observation",
@@ -200,7 +201,12 @@ FREE = ("kernels.", "evaluation.metrics", "errors")
 CONFINED = {
     "typer": {"cli", "commands.inspect", "commands.simulate", "commands.plan"},
     "rich": {"cli", "terminal", *COMMANDS} - {"commands"},
-    "numba": {"simulation.dynamics", "engines.markov.state_space", "engines.markov.recursions"},
+    "numba": {
+        "simulation.dynamics",
+        "engines.markov.state_space",
+        "engines.markov.recursions",
+        "engines.markov.reverse",
+    },
     "matplotlib": {"plotting"},
     "pydantic": set(CONFIG) - {"config"},
     "yaml": {"config.loading"},
