@@ -49,7 +49,7 @@ class Structure:
         count = len(processes.layout.theta)
         if count != 1:
             raise ConfigurationError(
-                "engine.name: expected a desired trajectory over one number, time or phase, with markov, found one over "
+                "engine.name: expected a desired trajectory over one number (time, phase) with markov, found one over "
                 f"{count}; set engine.name=dense or lowrank, or model.trajectory_input=phase"
             )
         if processes.periodic:

@@ -69,7 +69,7 @@ def run_filters(
         if failed >= 0:
             raise NotPositiveDefiniteError(
                 f"the variance of force {failed} of {len(sequences.order)} in the order of theta, given those before "
-                "it, is not positive; raise model.noise_sd, or look for impedance or hyperparameters that are not finite"
+                "it, is not positive; raise model.noise_sd, or look for impedance or hyperparameters that overflow"
             )
         result.append((values, stored))
     return result
