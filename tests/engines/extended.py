@@ -7,12 +7,14 @@ from numpy.typing import NDArray
 
 Extended = NDArray[np.longdouble]
 
-STATIONARY = np.array([[1, 0, -1 / np.longdouble(3)], [0, 1 / np.longdouble(3), 0], [-1 / np.longdouble(3), 0, 1]])
+STATIONARY = np.array(
+    [[1, 0, -1 / np.longdouble(3)], [0, 1 / np.longdouble(3), 0], [-1 / np.longdouble(3), 0, 1]]
+)
 
 
 @dataclass(frozen=True)
 class Chain:
-    """Samples in the order of θ: `place` λθ, `rows` what the force is of (f, f'/λ, f''/λ²)/σ, `force`, noise variance."""
+    """Samples in the order of θ: `place` λθ, `rows`, what the force is of (f, f'/λ, f''/λ²)/σ, force and noise."""
 
     place: Extended
     rows: Extended
@@ -68,7 +70,10 @@ def solved(chain: Chain, targets: Extended) -> tuple[np.longdouble, Extended, Ex
     covariance = np.einsum("ni,nmij,mj->nm", chain.rows, _covariance(chain.place, chain.place), chain.rows)
     factor = _cholesky(covariance + chain.noise * np.eye(len(covariance)))
     white = _forward(factor, chain.force[:, None])[:, 0]
-    total = -(white @ white + 2 * np.log(np.diag(factor)).sum() + len(white) * np.log(2 * np.longdouble(np.pi))) / 2
+    total = (
+        -(white @ white + 2 * np.log(np.diag(factor)).sum() + len(white) * np.log(2 * np.longdouble(np.pi)))
+        / 2
+    )
     cross = np.einsum("ni,nmij->nmj", chain.rows, _covariance(chain.place, targets))
     known = _forward(factor, cross.reshape(len(white), -1)).reshape(cross.shape)
     mean = np.einsum("nmj,n->mj", known, white)
