@@ -38,7 +38,7 @@ def gradients(plan, data, stored, weights, results):  # type: ignore[no-untyped-
         every = interval(end - begin)
         record = empty_record(every, size, data[3].shape[1])
         adjoint, information = np.zeros(size), np.zeros((size, size))
-        work, row = np.zeros((3, size)), empty_row(data)
+        work, row = (np.zeros(size), np.zeros(size), np.zeros(size)), empty_row(data)
         for first in range(begin + (end - begin - 1) // every * every, begin - 1, -every):
             last = min(first + every, end)
             place -= size + size * size
@@ -57,7 +57,7 @@ def smooth(plan, data, stored, targets, means, covariances):  # type: ignore[no-
         every = interval(end - begin)
         record = empty_record(every, size, data[3].shape[1])
         adjoint, information = np.zeros(size), np.zeros((size, size))
-        work, row = np.zeros((3, size)), empty_row(data)
+        work, row = (np.zeros(size), np.zeros(size), np.zeros(size)), empty_row(data)
         for first in range(begin + (end - begin - 1) // every * every, begin - 1, -every):
             last = min(first + every, end)
             place -= size + size * size
@@ -72,50 +72,57 @@ def smooth(plan, data, stored, targets, means, covariances):  # type: ignore[no-
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _back(plan, data, t, i, record, adjoint, information, row, work, weight, results):  # type: ignore[no-untyped-def]
     """From behind sample t to before the step to it; gradients only where `weight` is not zero."""
-    z, axes, sizes = data[0], data[3].shape[1], plan[4]
+    axes = data[3].shape[1]
     if plan[3][t]:
         for a in range(axes - 1, -1, -1):
             fill_row(plan, data, t, a, row)
-            _back_update(plan, t, i, a, record, adjoint, information, row, work, weight, results)
+            e, kappa = _back_update(i, a, record, adjoint, information, row, work[0])
+            if weight != 0.0:
+                _force_gradients(plan, t, i, a, record, adjoint, e, kappa, row, work, weight, results)
+            _add_information(i, a, record, information, kappa, row, work)
     if weight != 0.0:
-        mean, matrix = record[0][i], record[1][i]
-        for block in range(z.shape[1]):
+        _step_gradients(plan, data, t, i, record, adjoint, information, weight, results)
+    for block in range(data[0].shape[1]):
+        if data[0][t, block] != 0.0:
             first = first_state(plan, axes, t, block)
-            slope = step_gradient(sizes[block], first, mean, matrix, adjoint, information)
-            results[0][t, block] = weight * slope
-    for block in range(z.shape[1]):
-        if z[t, block] != 0.0:
-            first = first_state(plan, axes, t, block)
-            move(sizes[block], z[t, block], first, adjoint, information, False)
+            move(plan[4][block], data[0][t, block], first, adjoint, information, False)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def _back_update(plan, t, i, a, record, adjoint, information, row, work, weight, results):  # type: ignore[no-untyped-def]
-    """To before the observation of axis a at sample t."""
+def _step_gradients(plan, data, t, i, record, adjoint, information, weight, results):  # type: ignore[no-untyped-def]
+    for block in range(data[0].shape[1]):
+        first = first_state(plan, data[3].shape[1], t, block)
+        slope = step_gradient(plan[4][block], first, i, record[0], record[1], adjoint, information)
+        results[0][t, block] = weight * slope
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _back_update(i, a, record, adjoint, information, row, q):  # type: ignore[no-untyped-def]
+    """`adjoint` to before the observation of axis a, and q; returns e and κ."""
     gains, v, s = record[2], record[3][i, a], record[4][i, a]
     index, value = row
     size = adjoint.shape[0]
-    q, p = work[0], work[1]
     ahead = b = 0.0
     for j in range(size):
-        q[j] = 0.0
+        total = 0.0
         for k in range(size):
-            q[j] += information[j, k] * gains[i, a, k]
-        b += q[j] * gains[i, a, j]
+            total += information[j, k] * gains[i, a, k]
+        q[j] = total
+        b += total * gains[i, a, j]
         ahead += adjoint[j] * gains[i, a, j]
     e = (v - ahead) / s
-    kappa = (b / s + 1.0) / s
     for j in range(index.shape[0]):
         adjoint[index[j]] += e * value[j]
-    if weight != 0.0:
-        for j in range(size):
-            p[j] = e * adjoint[j] + q[j] / s
-        for j in range(index.shape[0]):
-            p[index[j]] -= kappa * value[j]
-        results[3][t, a] = -weight * e
-        results[4][a] += 0.5 * weight * (e * e - kappa)
-        _row_gradient(plan, t, i, a, record, e, p, row, work[2], weight, results)
-    # Λ⁻ = Λ + h pᵀ + p hᵀ with p = ½ κ h − q/s
+    return e, (b / s + 1.0) / s
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _add_information(i, a, record, information, kappa, row, work):  # type: ignore[no-untyped-def]
+    """Λ⁻ = Λ + h pᵀ + p hᵀ with p = ½ κ h − q/s."""
+    s = record[4][i, a]
+    q, p, _ = work
+    index, value = row
+    size = information.shape[0]
     for j in range(size):
         p[j] = -q[j] / s
     for j in range(index.shape[0]):
@@ -125,6 +132,21 @@ def _back_update(plan, t, i, a, record, adjoint, information, row, work, weight,
             information[index[j], k] += value[j] * p[k]
         for k in range(size):
             information[k, index[j]] += value[j] * p[k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _force_gradients(plan, t, i, a, record, adjoint, e, kappa, row, work, weight, results):  # type: ignore[no-untyped-def]
+    """By y, r, h and c of axis a at sample t."""
+    s = record[4][i, a]
+    q, p, product = work
+    index, value = row
+    for j in range(adjoint.shape[0]):
+        p[j] = e * adjoint[j] + q[j] / s
+    for j in range(index.shape[0]):
+        p[index[j]] -= kappa * value[j]
+    results[3][t, a] = -weight * e
+    results[4][a] += 0.5 * weight * (e * e - kappa)
+    _row_gradient(plan, t, i, a, record, e, p, row, product, weight, results)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)

@@ -114,33 +114,33 @@ def add_stationary(size, i, vector, product):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
-def step_gradient(size, i, mean, matrix, adjoint, information):  # type: ignore[no-untyped-def]
+def step_gradient(size, i, t, means, matrices, adjoint, information):  # type: ignore[no-untyped-def]
     """∂L/∂z of the step of the block at `i`, by dF/dz = A F and what is behind the step.
 
-    `mean` m, `matrix` D; `adjoint` μ = ∂L/∂m and `information` Λ = −∂²L/∂m², so that ∂L/∂D = ½ (μμᵀ − Λ):
+    `means[t]` m, `matrices[t]` D; `adjoint` μ = ∂L/∂m and `information` Λ = −∂²L/∂m², so that ∂L/∂D = ½ (μμᵀ − Λ):
     Σ_i μ_i (A m)_i + Σ_ij (μ_i μ_j − Λ_ij) (A D)_ij over the rows i of the block.
     """
-    states = mean.shape[0]
+    states = adjoint.shape[0]
     if size == 3:
         a, b, c = adjoint[i], adjoint[i + 1], adjoint[i + 2]
-        x, y, w = mean[i], mean[i + 1], mean[i + 2]
+        x, y, w = means[t, i], means[t, i + 1], means[t, i + 2]
         total = a * y + b * w - c * (x + 3.0 * (y + w))
         for j in range(states):
-            x, y, w = matrix[i, j], matrix[i + 1, j], matrix[i + 2, j]
+            x, y, w = matrices[t, i, j], matrices[t, i + 1, j], matrices[t, i + 2, j]
             m = adjoint[j]
             total += (a * m - information[i, j]) * y + (b * m - information[i + 1, j]) * w
             total -= (c * m - information[i + 2, j]) * (x + 3.0 * (y + w))
     elif size == 2:
         a, b = adjoint[i], adjoint[i + 1]
-        x, y = mean[i], mean[i + 1]
+        x, y = means[t, i], means[t, i + 1]
         total = a * y - b * (x + 2.0 * y)
         for j in range(states):
-            x, y = matrix[i, j], matrix[i + 1, j]
+            x, y = matrices[t, i, j], matrices[t, i + 1, j]
             m = adjoint[j]
             total += (a * m - information[i, j]) * y - (b * m - information[i + 1, j]) * (x + 2.0 * y)
     else:
         a = adjoint[i]
-        total = -a * mean[i]
+        total = -a * means[t, i]
         for j in range(states):
-            total -= (a * adjoint[j] - information[i, j]) * matrix[i, j]
+            total -= (a * adjoint[j] - information[i, j]) * matrices[t, i, j]
     return total
