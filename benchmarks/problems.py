@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import gpytorch
+import numpy as np
 import torch
 from torch import Tensor
 
+from bayes_impedance.engines.given_impedance import Processes
+from bayes_impedance.features import Features
 from bayes_impedance.kernels import (
     ImpedanceKernel,
     ImpedanceProcess,
@@ -64,3 +69,58 @@ class PlainGP(gpytorch.models.ExactGP):
 
     def forward(self, x: Tensor) -> gpytorch.distributions.MultivariateNormal:
         return gpytorch.distributions.MultivariateNormal(self.mean_module(x), self.covar_module(x))
+
+
+class ScalarProblem(NamedTuple):
+    """Samples over one θ, the processes beside impedance, and impedance, for engines that are given it."""
+
+    features: Features
+    processes: Processes
+    impedance: Tensor
+
+
+def scalar_problem(
+    n: int,
+    step: float,
+    axes: int = 1,
+    residual: bool = False,
+    repetitions: int = 10,
+    seed: int = 0,
+) -> ScalarProblem:
+    """Repetitions whose pooled samples lie λΔ = `step` apart on average, ℓ = .5; residual over θ, or none.
+
+    A tenth of the samples repeat the θ of another exactly.
+    """
+    generator = np.random.default_rng(seed)
+    lengthscale = 0.5
+    theta = np.sort(generator.uniform(0.0, step * n * lengthscale / 5.0**0.5, size=n))
+    theta[1::10] = theta[0::10][: len(theta[1::10])]
+    # Sample i is of repetition i mod `repetitions`, one repetition after another, as logs have it.
+    order = np.argsort(np.arange(n) % repetitions, kind="stable")
+    inputs = np.zeros((axes, 1, n, 3))
+    inputs[..., 0] = theta
+    inputs[..., 1] = 1.0 + 0.2 * np.sin(3.0 * theta)
+    inputs[..., 2] = 0.6 * np.cos(3.0 * theta)
+    forces = [np.sin((2.0 + a) * theta) + 0.2 * generator.standard_normal(n) for a in range(axes)]
+    features = Features(
+        groups=("0",),
+        inputs=torch.from_numpy(inputs[:, :, order]),
+        force=torch.from_numpy(np.stack(forces)[:, None, order]),
+        trajectory_mean=torch.zeros(axes, 1, n, 3, dtype=torch.float64),
+        valid=None,
+        rows=(np.stack([np.arange(n) % repetitions, np.arange(n) // repetitions], axis=-1)[order],),
+    )
+    batch = torch.Size([axes, 1])
+    trajectory = StationaryKernel("matern52", batch_shape=batch).double()
+    trajectory.sd, trajectory.lengthscale = 0.02, lengthscale
+    own = StationaryKernel("matern32", batch_shape=batch, active_dims=(0,)).double()
+    own.sd, own.lengthscale = 0.5, 0.3
+    layout = InputLayout(theta=(0,), theta_velocity=(1,), theta_acceleration=(2,))
+    noise = torch.full((axes, 1, 1), 0.04, dtype=torch.float64, requires_grad=True)
+    levels = torch.tensor([300.0, 20.0, 1.5], dtype=torch.float64)[:, None, None]
+    matrices = levels * (0.8 * torch.eye(axes, dtype=torch.float64) + 0.2)
+    return ScalarProblem(
+        features,
+        Processes(layout, trajectory, (own,) if residual else (), noise),
+        matrices.expand(1, n, 3, axes, axes).contiguous().requires_grad_(),
+    )

@@ -126,6 +126,7 @@ ENGINES = (
     "engines.given_dense",
     "engines.markov.state_space",
     "engines.markov.recursions",
+    "engines.markov.reverse",
     "engines.markov.arrangement",
     "engines.markov.likelihood",
     "engines.markov.observation",
@@ -233,7 +234,12 @@ FREE = ("kernels.", "evaluation.metrics", "errors")
 CONFINED = {
     "typer": {"cli", "commands.inspect", "commands.simulate", "commands.plan"},
     "rich": {"cli", "terminal", *COMMANDS} - {"commands"},
-    "numba": {"simulation.dynamics", "engines.markov.state_space", "engines.markov.recursions"},
+    "numba": {
+        "simulation.dynamics",
+        "engines.markov.state_space",
+        "engines.markov.recursions",
+        "engines.markov.reverse",
+    },
     "matplotlib": {"plotting"},
     "pydantic": set(CONFIG) - {"config"},
     "yaml": {"config.loading"},

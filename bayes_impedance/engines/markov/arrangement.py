@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -48,8 +49,8 @@ class Structure:
         count = len(processes.layout.theta)
         if count != 1:
             raise ConfigurationError(
-                f"engine.name: expected a desired trajectory over one number (time or phase) with markov, found {count} "
-                "components of theta; set engine.name=dense or lowrank, or model.trajectory_input=phase"
+                "engine.name: expected a desired trajectory over one number (time, phase) with markov, found one over "
+                f"{count}; set engine.name=dense or lowrank, or model.trajectory_input=phase"
             )
         if processes.periodic:
             raise ConfigurationError(
@@ -113,14 +114,18 @@ class Samples:
 
     def followed_by(self, other: Samples) -> Samples:
         """These samples, then the others."""
-        parts = [(getattr(self, field.name), getattr(other, field.name)) for field in fields(self)]
-        return Samples(
-            *(torch.cat(part) if isinstance(part[0], Tensor) else np.concatenate(part) for part in parts)
-        )
+        parts = {
+            field.name: (getattr(self, field.name), getattr(other, field.name)) for field in fields(self)
+        }
+        joined: dict[str, Any] = {
+            name: torch.cat(part) if isinstance(part[0], Tensor) else np.concatenate(part)
+            for name, part in parts.items()
+        }
+        return replace(self, **joined)
 
     def in_order(self, order: Integers) -> Samples:
         """The same samples in another order."""
-        return Samples(*(getattr(self, field.name)[order] for field in fields(self)))
+        return replace(self, **{field.name: getattr(self, field.name)[order] for field in fields(self)})
 
 
 @dataclass(frozen=True)
@@ -262,7 +267,7 @@ def _check_increasing(steps: Floats, term: Term, theta: Floats) -> None:
 
 
 def _places(process: Integers, unseen: NDArray[np.bool_], starts: Integers) -> Integers:
-    """Which of the processes of its sequence a sample belongs to; those that nothing is observed of are one, the last."""
+    """Which process of its sequence each sample belongs to; those that nothing is observed of are the last one."""
     result = np.zeros(len(process), dtype=np.int64)
     for begin, length in zip(starts, _lengths(starts, len(process)), strict=True):
         part = slice(begin, begin + length)

@@ -25,8 +25,8 @@ from bayes_impedance.kernels.impedance import TRAJECTORY_ORDER, Latent
 class MarkovEngine:
     """Exact inference given impedance by a Kalman filter over θ, for a Matérn-5/2 desired trajectory.
 
-    θ is one number; samples are sorted by it once, here. `processes` of later calls may differ in their hyperparameters,
-    not in anything else. Axes are filters of their own unless they are `coupled`.
+    θ is one number; samples are sorted by it once, here. `processes` of later calls may differ in hyperparameters only.
+    Axes are filters of their own unless they are `coupled`.
 
     Raises:
         ConfigurationError: the processes have no state space of a few dimensions, or the samples no common order.

@@ -10,7 +10,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from bayes_impedance.engines.markov.arrangement import Sequences
-from bayes_impedance.engines.markov.recursions import gradients, log_likelihoods, smooth, stored_length
+from bayes_impedance.engines.markov.recursions import log_likelihoods, stored_length
+from bayes_impedance.engines.markov.reverse import gradients, smooth
 from bayes_impedance.errors import NotPositiveDefiniteError
 
 
@@ -67,9 +68,8 @@ def run_filters(
         failed = log_likelihoods(plan, data, stored, values)
         if failed >= 0:
             raise NotPositiveDefiniteError(
-                f"the variance of force {failed} of {len(sequences.order)} in the order of theta, given those before it, "
-                "is not positive; raise model.noise_sd, or check impedance and hyperparameters for values that are not "
-                "finite"
+                f"the variance of force {failed} of {len(sequences.order)} in the order of theta, given those before "
+                "it, is not positive; raise model.noise_sd, or look for impedance or hyperparameters that overflow"
             )
         result.append((values, stored))
     return result
