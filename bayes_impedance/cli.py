@@ -228,6 +228,7 @@ def train(
             )
         with terminal.training_progress(console, settings.training, "training") as progress:
             model = model.fit(prepared, progress, journal=journal)
+        console.print(str(model.engine), highlight=False, soft_wrap=True)
         save_model(model, out)
         if not model.report.interrupted:
             journal.remove()

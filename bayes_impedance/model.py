@@ -256,8 +256,8 @@ class ImpedanceModel:
             raise LogError("expected a log with force, found none; name log.columns.force")
         model = self._force_model(feature_map)
         if self._is_function:
-            value = function_evidence(self.config, model, self._functions, features)
-            return {self._parts(prepared.axes)[0]: value}
+            evidence = function_evidence(self.config, model, self._functions, features)
+            return {self._parts(prepared.axes)[0]: evidence}
         self._check_capacity(prepared)
         with torch.no_grad():
             value = log_evidence(model, features, self.config.engine.jitter)

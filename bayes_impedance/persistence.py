@@ -5,6 +5,7 @@ The folder holds
     config.yaml                   the whole configuration
     hyperparameters.safetensors   unconstrained hyperparameters, by name
     data.safetensors              the prepared training log
+    functions.safetensors         impedance functions and their covariance, where impedance is a function
     metadata.json                 schema and package version, training report, fingerprints
 """
 
@@ -21,21 +22,28 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
 from bayes_impedance.config import dump_config, load_config
+from bayes_impedance.engines.choice import EngineChoice
 from bayes_impedance.errors import BayesImpedanceError, ModelFolderError
 from bayes_impedance.features import FeatureMap
+from bayes_impedance.impedance_functions.train import FittedFunctions
 from bayes_impedance.model import Fit, ImpedanceModel
 from bayes_impedance.outputs import whole_folder
 from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.priors import build_force_model
 from bayes_impedance.training import RestartReport, TrainingReport
 
+Array = NDArray[np.float64]
+
 SCHEMA_VERSION = 1
 METADATA = "metadata.json"
 FILES = ("config.yaml", "hyperparameters.safetensors", "data.safetensors")
+#: Only where impedance is a function.
+FUNCTIONS = "functions.safetensors"
 
 
 def save_model(model: ImpedanceModel, folder: str | Path) -> None:
@@ -62,13 +70,18 @@ def save_model(model: ImpedanceModel, folder: str | Path) -> None:
         # Not save_file: a full disk is no OSError there.
         (place / "hyperparameters.safetensors").write_bytes(save(tensors))
         (place / "data.safetensors").write_bytes(save(arrays))
+        files = list(FILES)
+        if fit.functions is not None:
+            (place / FUNCTIONS).write_bytes(save(_function_arrays(fit.functions)))
+            files.append(FUNCTIONS)
         metadata = {
             "schema_version": SCHEMA_VERSION,
             "package_version": version("bayes-impedance"),
             "log": fit.log.header(),
             "data_fingerprint": fit.log.fingerprint(),
             "report": _finite_or_null(asdict(fit.report)),
-            "files": {name: _digest(place / name) for name in FILES},
+            "functions": None if fit.functions is None else _function_header(fit.functions),
+            "files": {name: _digest(place / name) for name in files},
         }
         (place / METADATA).write_text(
             json.dumps(metadata, indent=2, allow_nan=False) + "\n", encoding="utf-8"
@@ -93,10 +106,11 @@ def load_model(folder: str | Path) -> ImpedanceModel:
     """
     place = Path(folder)
     metadata = _metadata(place)
-    for name in FILES:
+    expected = (*FILES, FUNCTIONS) if metadata.get("functions") else FILES
+    for name in expected:
         if not (place / name).is_file():
             raise ModelFolderError(
-                f"{place}: expected the files {', '.join(FILES)}, found no {name}; copy the whole folder again, "
+                f"{place}: expected the files {', '.join(expected)}, found no {name}; copy the whole folder again, "
                 "or train again"
             )
         if _digest(place / name) != metadata["files"].get(name):
@@ -137,9 +151,34 @@ def _assemble(place: Path, metadata: Mapping[str, Any]) -> ImpedanceModel:
     lists["log_sd"] = {
         name: [_numbers(row, math.nan) for row in rows] for name, rows in report["log_sd"].items()
     }
-    return ImpedanceModel(
-        config, Fit(force_model, log, TrainingReport(**{**report, **lists, "restarts": restarts}))
+    functions = None
+    if metadata.get("functions"):
+        functions = _functions(metadata["functions"], load_file(place / FUNCTIONS))
+    training = TrainingReport(**{**report, **lists, "restarts": restarts})
+    return ImpedanceModel(config, Fit(force_model, log, training, functions))
+
+
+def _function_header(functions: FittedFunctions) -> dict[str, Any]:
+    return {
+        "groups": list(functions.groups),
+        "engine": {"name": functions.engine.name, "reason": functions.engine.reason},
+        "inducing": [inducing is not None for inducing in functions.inducing],
+    }
+
+
+def _function_arrays(functions: FittedFunctions) -> dict[str, Array]:
+    inducing = {f"inducing.{j}": own.numpy() for j, own in enumerate(functions.inducing) if own is not None}
+    return {"point": functions.point, "covariance": np.ascontiguousarray(functions.covariance), **inducing}
+
+
+def _functions(header: Mapping[str, Any], arrays: Mapping[str, Array]) -> FittedFunctions:
+    inducing = tuple(
+        torch.from_numpy(arrays[f"inducing.{j}"]) if there else None
+        for j, there in enumerate(header["inducing"])
     )
+    engine = EngineChoice(str(header["engine"]["name"]), str(header["engine"]["reason"]))
+    groups = tuple(str(group) for group in header["groups"])
+    return FittedFunctions(groups, arrays["point"], arrays["covariance"], inducing, engine)
 
 
 def _metadata(place: Path) -> dict[str, Any]:

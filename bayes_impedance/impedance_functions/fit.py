@@ -64,23 +64,30 @@ def find_mode(
         point, moved = update_variation(density, point, precision)
         density.anchor = point
         density.renew()
-        point = climb(point, precision, max_iterations)
+        point = climb(point, laplace.covariance(precision), max_iterations)
         precision = _precision(density, point)
         if max(moved, np.max(np.abs(point[density.weight_count :] - before), initial=0.0)) < SETTLED:
             break
     return _mode(density, point, precision, climb)
 
 
-def find_weights(density: Density, start: Array, max_iterations: int, gradient_tolerance: float) -> Mode:
+def find_weights(
+    density: Density, start: Array, scale: Array | None, max_iterations: int, gradient_tolerance: float
+) -> Mode:
     """Climb from `start` over the weights alone, at its hyperparameters.
+
+    `scale`: a covariance `(weights, weights)` that is known from other forces, and tells in which steps to climb.
 
     Raises:
         NotPositiveDefiniteError: the likelihood is not finite somewhere on the way.
     """
     density.free[density.weight_count :] = False
     climb = _Climb(density, gradient_tolerance, None)
-    point = climb(start, None, min(FIRST, max_iterations))
-    point = climb(point, _precision(density, point), max_iterations)
+    point = start
+    if scale is None:
+        point = climb(start, None, min(FIRST, max_iterations))
+        scale = laplace.covariance(_precision(density, point))
+    point = climb(point, scale, max_iterations)
     return _mode(density, point, _precision(density, point), climb)
 
 
@@ -107,11 +114,9 @@ class _Climb:
         self.iterations = self.evaluations = 0
         self.outcome = ""
 
-    def __call__(self, start: Array, precision: Array | None, max_iterations: int) -> Array:
+    def __call__(self, start: Array, scale: Array | None, max_iterations: int) -> Array:
         places = np.flatnonzero(self.density.free)
-        root: Array = np.asarray(
-            np.eye(len(places)) if precision is None else np.linalg.cholesky(laplace.covariance(precision))
-        )
+        root: Array = np.asarray(np.eye(len(places)) if scale is None else np.linalg.cholesky(scale))
         best = -np.inf
 
         def at(step: Array) -> Array:

@@ -13,7 +13,7 @@ from bayes_impedance.config import Config
 from bayes_impedance.features import Features
 from bayes_impedance.impedance_functions.conditioned import Conditioned
 from bayes_impedance.impedance_functions.density import Density
-from bayes_impedance.impedance_functions.fit import find_weights
+from bayes_impedance.impedance_functions.fit import Mode, find_weights
 from bayes_impedance.impedance_functions.function import build_functions
 from bayes_impedance.impedance_functions.log_matrix import LogMatrix
 from bayes_impedance.impedance_functions.train import FittedFunctions, build_density
@@ -38,22 +38,38 @@ def condition(
         ConfigurationError: the engine cannot hold the processes at these samples.
     """
     density = build_density(config, model, given, fitted.inducing, fitted.engine.name)
-    hyperparameters = fitted.point[len(fitted.point) - (len(density.free) - density.weight_count) :]
-    weights = _weights_of(density, fitted)
     if trained_on:
-        own = np.concatenate(
-            [weights, np.arange(len(fitted.point) - len(hyperparameters), len(fitted.point))]
-        )
-        free = np.concatenate(
-            [np.ones(density.weight_count, dtype=bool), density.free[density.weight_count :]]
-        )
-        place = np.cumsum(_free_of(density, fitted)) - 1
-        kept = place[own[free]]
-        return Conditioned(density, fitted.point[own], fitted.covariance[np.ix_(kept, kept)], free)
-    start = np.concatenate([fitted.point[weights] if len(weights) else density.start()[: density.weight_count],
-                            hyperparameters])  # fmt: skip
-    mode = find_weights(density, start, config.training.max_iterations, config.training.gradient_tolerance)
+        first = len(fitted.point) - (len(density.free) - density.weight_count)
+        own = np.concatenate([_weights_of(density, fitted), np.arange(first, len(fitted.point))])
+        learned = np.concatenate([np.ones(first, dtype=bool), density.free[density.weight_count :]])
+        kept = (np.cumsum(learned) - 1)[own[density.free]]
+        return Conditioned(density, fitted.point[own], fitted.covariance[np.ix_(kept, kept)], density.free)
+    mode = _mode_of_weights(config, density, fitted)
     return Conditioned(density, mode.point, mode.covariance, density.free)
+
+
+def function_evidence(config: Config, model: ForceModel, fitted: FittedFunctions, given: Features) -> float:
+    """log p(forces of `given`) at the hyperparameters, the functions integrated out by Laplace's method [nats].
+
+    Raises:
+        NotPositiveDefiniteError: the likelihood is not finite.
+        ConfigurationError: the engine cannot hold the processes at these samples.
+    """
+    density = build_density(config, model, given, fitted.inducing, fitted.engine.name)
+    mode = _mode_of_weights(config, density, fitted)
+    return mode.log_evidence - float(density.log_hyperpriors().detach())
+
+
+def _mode_of_weights(config: Config, density: Density, fitted: FittedFunctions) -> Mode:
+    """Functions given the density's forces, at the fitted hyperparameters."""
+    weights = _weights_of(density, fitted)
+    start, scale = density.start(), None
+    if len(weights):
+        start[: density.weight_count] = fitted.point[weights]
+        scale = fitted.covariance[np.ix_(weights, weights)]
+    return find_weights(
+        density, start, scale, config.training.max_iterations, config.training.gradient_tolerance
+    )
 
 
 def compute_function_posterior(
@@ -129,9 +145,3 @@ def _weights_of(density: Density, fitted: FittedFunctions) -> NDArray[np.int64]:
         places.append(own[chosen].reshape(-1))
         start += count
     return np.concatenate(places)
-
-
-def _free_of(density: Density, fitted: FittedFunctions) -> NDArray[np.bool_]:
-    """Coordinates of the fitted point that were learned: every weight, and the hyperparameters that are not fixed."""
-    hyperparameters = density.free[density.weight_count :]
-    return np.concatenate([np.ones(len(fitted.point) - len(hyperparameters), dtype=bool), hyperparameters])
