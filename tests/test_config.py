@@ -53,6 +53,7 @@ def test_shipped_configurations_are_these():
         "time",
         "phase",
         "admittance",
+        "arm",
         "coupled",
         "position",
         "position_velocity",
@@ -114,7 +115,7 @@ def test_unknown_name_lists_or_suggests_the_shipped_ones(tmp_path):
         load_config("phse")
     with pytest.raises(
         ConfigurationError,
-        match="shipped are admittance, coupled, phase, position, position_velocity, rec.*, time",
+        match="shipped are admittance, arm, coupled, phase, position, position_velocity, rec.*, time",
     ):
         load_config(tmp_path / "nothing" / "like" / "it.json")
 

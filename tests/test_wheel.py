@@ -35,6 +35,7 @@ def test_wheel_outside_the_checkout(tmp_path: Path) -> None:
     assert result.returncode == 0, result.stderr
     assert result.stdout.split() == [
         "admittance",
+        "arm",
         "coupled",
         "phase",
         "position",
