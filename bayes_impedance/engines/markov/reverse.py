@@ -1,7 +1,7 @@
 """The way back of the Kalman filter, compiled: gradients of the log likelihood, and the smoother.
 
 For the log likelihood L of what is still to come, μ = ∂L/∂m and Λ = −∂²L/∂m² are kept. With q = Λg, b = g·q,
-e = (v − μ·g)/s and κ = b/s² + 1/s an observation (see `recursions`) gives
+e = (v − μ·g)/s and κ = b/s² + 1/s an observation (see `log_likelihoods`) gives
 
     ∂L/∂y = −e,     ∂L/∂r = ½ (e² − κ),     ∂L/∂h = e m + P (e μ⁻ − κ h + q/s)
     μ⁻ = μ + e h,     Λ⁻ = Λ − (q hᵀ + h qᵀ)/s + κ h hᵀ
@@ -40,8 +40,12 @@ class Work(NamedTuple):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def gradients(plan, data, stored, weights, results):  # type: ignore[no-untyped-def]
-    """∂(Σ_k `weights[k]` log p_k) by each array of `data` to `results`, which are zeros of the same shapes."""
+def sweep(plan, data, stored, weights, results, targets, means, covariances):  # type: ignore[no-untyped-def]
+    """Gradients, posteriors, or both.
+
+    ∂(Σ_k `weights[k]` log p_k) by each array of `data` to `results`, zeros of the same shapes, unless weights are zero;
+    the posterior of the states of the blocks at sample t to row `targets[t]` of `means` and `covariances`, unless −1.
+    """
     place = stored.shape[0]
     for k in range(plan.states.shape[0] - 1, -1, -1):
         begin, end, size = plan.starts[k], plan.starts[k + 1], plan.states[k]
@@ -54,28 +58,10 @@ def gradients(plan, data, stored, weights, results):  # type: ignore[no-untyped-
             place -= size + size * size
             replay(plan, data, first, last, stored[place : place + size + size * size], record, row)
             for t in range(last - 1, first - 1, -1):
-                _back(plan, data, t, t - first, record, adjoint, information, row, work, weights[k], results)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def smooth(plan, data, stored, targets, means, covariances):  # type: ignore[no-untyped-def]
-    """Posterior of the states of the blocks at sample t to row `targets[t]` of the results, unless that is −1."""
-    place = stored.shape[0]
-    for k in range(plan.states.shape[0] - 1, -1, -1):
-        begin, end, size = plan.starts[k], plan.starts[k + 1], plan.states[k]
-        every = interval(end - begin)
-        record, row = empty_record(every, size, data.y.shape[1]), empty_row(data)
-        adjoint, information = np.zeros(size), np.zeros((size, size))
-        work = Work(np.zeros(size), np.zeros(size), np.zeros(size))
-        for first in range(begin + (end - begin - 1) // every * every, begin - 1, -every):
-            last = min(first + every, end)
-            place -= size + size * size
-            replay(plan, data, first, last, stored[place : place + size + size * size], record, row)
-            for t in range(last - 1, first - 1, -1):
-                j = targets[t]
+                j = targets[t] if targets.shape[0] > 0 else -1
                 if j >= 0:
                     _smoothed(plan, t, t - first, record, adjoint, information, means[j], covariances[j])
-                _back(plan, data, t, t - first, record, adjoint, information, row, work, 0.0, data)
+                _back(plan, data, t, t - first, record, adjoint, information, row, work, weights[k], results)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
