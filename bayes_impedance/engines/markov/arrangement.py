@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bayes_impedance.engines.given_impedance import Processes
+from bayes_impedance.engines.markov.recursions import Floats, Integers, Plan
 from bayes_impedance.engines.markov.state_space import RATE
 from bayes_impedance.errors import ConfigurationError
 from bayes_impedance.features import Features
 from bayes_impedance.kernels.impedance import InputLayout
 from bayes_impedance.kernels.stationary import Matern, StationaryKernel
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 #: Most states that one filter may hold: its time grows with their square.
 LARGEST_STATE = 128
@@ -133,14 +131,13 @@ class Sequences:
     """Samples in the order of θ, cut into sequences that are independent of each other.
 
     `order` `(n,)`: which sample each step takes; `group` `(sequences,)`; `steps` `(n, 1 + terms)`: how far the input
-    of the trajectory and of each residual term moves, on the way from the sample before that shares it; `plan`: as
-    `recursions` takes it.
+    of the trajectory and of each residual term moves, on the way from the sample before that shares it.
     """
 
     order: Integers
     group: Integers
     steps: Tensor
-    plan: tuple[Integers, Integers, Integers, NDArray[np.bool_], Integers, Integers]
+    plan: Plan
 
 
 def arrange(samples: Samples, structure: Structure, axes: int) -> Sequences:
@@ -180,7 +177,7 @@ def arrange(samples: Samples, structure: Structure, axes: int) -> Sequences:
     )
     at[:, 1] += places[1] * widths[1]
     offsets = [3 * np.arange(axes), np.cumsum(np.tile(sizes, axes)) - np.tile(sizes, axes)]
-    plan = (
+    plan = Plan(
         np.append(starts, len(order)),
         states,
         at,

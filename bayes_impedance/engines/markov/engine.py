@@ -59,7 +59,7 @@ class MarkovEngine:
     def posterior(
         self, processes: Processes, impedance: Tensor, target: Features, target_impedance: Tensor
     ) -> Mapping[Latent, MeanAndVariance]:
-        """See `ConditionalEngine`; zero at the padding of `target`.
+        """See `ConditionalEngine`; no variance at the padding of `target`.
 
         Raises:
             NotPositiveDefiniteError: rounding left no positive variance of the forces.

@@ -10,16 +10,19 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from bayes_impedance.engines.markov.arrangement import Sequences
-from bayes_impedance.engines.markov.recursions import log_likelihoods, stored_length
-from bayes_impedance.engines.markov.reverse import gradients, smooth
+from bayes_impedance.engines.markov.recursions import Data, log_likelihoods, stored_length
+from bayes_impedance.engines.markov.reverse import sweep
 from bayes_impedance.errors import NotPositiveDefiniteError
+
+#: Rows, means and covariances of a way back that smooths nothing.
+NO_TARGETS = (np.zeros(0, dtype=np.int64), np.zeros((0, 0)), np.zeros((0, 0, 0)))
 
 
 class FilterLikelihood(torch.autograd.Function):
     """log p(y) of every sequence, `(filters, sequences)` [nats]; filters share the order of samples, n of them.
 
     Args of `apply`: z `(filters, n, blocks)`, h `(filters, n, axes, 3 axes)` [N], c `(filters, axes, terms)` [N],
-    y `(filters, n, axes)` [N], r `(filters, axes)` [N²], as in `recursions`, then the `Sequences`.
+    y `(filters, n, axes)` [N], r `(filters, axes)` [N²], as in `Data`, then the `Sequences`.
     """
 
     @staticmethod
@@ -45,9 +48,9 @@ class FilterLikelihood(torch.autograd.Function):
         arrays = ctx.saved_tensors
         results = tuple(torch.zeros_like(value) for value in arrays)
         for i, stored in enumerate(ctx.stored):
-            data = tuple(value[i].numpy() for value in arrays)
-            out = tuple(value[i].numpy() for value in results)
-            gradients(ctx.sequences.plan, data, stored, weights[i].contiguous().numpy(), out)
+            data = Data(*(value[i].numpy() for value in arrays))
+            out = Data(*(value[i].numpy() for value in results))
+            sweep(ctx.sequences.plan, data, stored, weights[i].contiguous().numpy(), out, *NO_TARGETS)
         return *results, None
 
 
@@ -62,8 +65,8 @@ def run_filters(
     plan = sequences.plan
     result = []
     for i in range(arrays[0].shape[0]):
-        data = tuple(value[i].numpy() for value in arrays)
-        stored = np.zeros(stored_length(plan[0], plan[1]) if store else 0)
+        data = Data(*(value[i].numpy() for value in arrays))
+        stored = np.zeros(stored_length(plan) if store else 0)
         values = np.zeros(len(sequences.group))
         failed = log_likelihoods(plan, data, stored, values)
         if failed >= 0:
@@ -85,11 +88,12 @@ def smoothed_states(
     Raises:
         NotPositiveDefiniteError: rounding left no positive variance of a force.
     """
-    width, count = int(sequences.plan[4].sum()), int((targets >= 0).sum())
+    width, count = int(sequences.plan.sizes.sum()), int((targets >= 0).sum())
     arrays = [value.contiguous() for value in arrays]
+    none = np.zeros(len(sequences.group))
     means = torch.zeros(arrays[0].shape[0], count, width, dtype=torch.float64)
     covariances = torch.zeros(*means.shape, width, dtype=torch.float64)
     for i, (_, stored) in enumerate(run_filters(arrays, sequences, store=True)):
-        data = tuple(value[i].numpy() for value in arrays)
-        smooth(sequences.plan, data, stored, targets, means[i].numpy(), covariances[i].numpy())
+        data = Data(*(value[i].numpy() for value in arrays))
+        sweep(sequences.plan, data, stored, none, data, targets, means[i].numpy(), covariances[i].numpy())
     return means, covariances
