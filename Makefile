@@ -41,6 +41,7 @@ format: $(INSTALLED)
 # Times, each beside its competitor in the same run; writes benchmarks/results.json. A process for each file: the
 # threads and the memory that one comparison leaves behind do not touch the next.
 bench: $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[bench]'
 	for file in benchmarks/test_*.py; do \
 		$(BIN)/python -m pytest $$file --benchmark-disable-gc -q -p no:cacheprovider -n 0 || exit 1; done
 
