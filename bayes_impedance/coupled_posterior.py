@@ -1,7 +1,8 @@
 """Posteriors where axes are coupled: the logarithms of the terms of K, D and M, jointly at each sample.
 
 Every latent is conditioned on the forces of all axes together. Levels that were learned enter as Gaussian offsets b of
-log level and log coupling (see `posterior`), of which a pair's terms take their share: g_r gains Σ_b T_rb b.
+log level and log coupling, as where axes are independent; a pair's terms take their share of them: g_r gains
+Σ_b T_rb b.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bayes_impedance.conditioning import Moments, chunks, entry_of, offset_covariance, unwarped
+from bayes_impedance.engines.coupled_loop import CoupledLoopEvidence
 from bayes_impedance.engines.dense import Factor
 from bayes_impedance.features import Features
 from bayes_impedance.kernels.coupled import CoupledInteractionKernel, by_axis, join_axes, rows_of
@@ -96,9 +98,16 @@ class CoupledConditioner:
         self.factor: Factor | None = None
         if given is not None:
             self.inputs = self._joined(given)
-            self.factor = Factor(self.kernel, observations(model, given), jitter)
+            forces = observations(model, given)
+            self.factor = Factor(self.kernel, forces, jitter)
             self.white_loading = self.factor.whiten(self._level_loading(self.inputs))
             self.level_covariance = offset_covariance(self.white_loading, self.variance)
+            self.loop: CoupledLoopEvidence | None = None
+            if given.loop is not None:
+                self.loop = CoupledLoopEvidence(self.kernel.impedance, self.factor, forces, given.loop)
+                loading = self._by_level(self.loop.apparent.loading) - self.loop.white.mT @ self.white_loading
+                self.loop_levels = self.level_covariance @ loading.mT
+                self.loop_gain = self.loop.gain(self.loop.covariance + loading @ self.loop_levels)
 
     def moments(self, target: Features, latents: Sequence[Latent]) -> dict[Latent, Moments]:
         """Moments of latents that are no impedance, `(axes, groups, m)` each."""
@@ -137,7 +146,15 @@ class CoupledConditioner:
             location = prior_location + (cross.mT @ self.factor.alpha.unsqueeze(-1)).squeeze(-1)
             known = (own - white.square().sum(-2)).clamp_min(0.0)
             rest = loading - white.mT @ self.white_loading
-            variance = known + ((rest @ self.level_covariance) * rest).sum(-1) + noise
+            variance = known + ((rest @ self.level_covariance) * rest).sum(-1)
+            if self.loop is not None:
+                with_loop = -white.mT @ self.loop.white
+                if latent is Latent.FORCE:
+                    with_loop = with_loop + self.loop.apparent.force_covariance(x)
+                location = location + (with_loop @ self.loop.jacobian.slope.unsqueeze(-1)).squeeze(-1)
+                with_loop = with_loop + rest @ self.loop_levels
+                variance = (variance - ((with_loop @ self.loop_gain) * with_loop).sum(-1)).clamp_min(0.0)
+            variance = variance + noise
         rows = (location, variance, prior_location, prior_variance)
         a, b, c, d = (by_axis(part, self.kernel.impedance.axes) for part in rows)
         return a, b, c, d
@@ -170,18 +187,25 @@ class CoupledConditioner:
         known = torch.diag_embed(own) - each @ each.mT
         rest = loading - each @ self.white_loading.unsqueeze(-3)
         covariance = known + rest @ self.level_covariance.unsqueeze(-3) @ rest.mT
+        if self.loop is not None:
+            with_loop = self.loop.apparent.term_covariance(x, order) - each @ self.loop.white.unsqueeze(-3)
+            shift = shift + (with_loop @ self.loop.jacobian.slope[:, None, :, None]).squeeze(-1)
+            with_loop = with_loop + rest @ self.loop_levels.unsqueeze(-3)
+            covariance = covariance - with_loop @ self.loop_gain.unsqueeze(-3) @ with_loop.mT
         variance = known.diagonal(dim1=-2, dim2=-1).clamp_min(0.0)
         location = unwarped(before + shift, before.expand(shape), variance, own)
         return location, covariance, shown.reshape(-1).expand(shape), prior_covariance
 
     def _level_loading(self, x: Tensor) -> Tensor:
         """Derivative of E[u] by the logarithms of levels and couplings of K, D and M, `(groups, n · axes, 3 terms)`."""
-        columns = []
-        for order, process in enumerate(self.kernel.impedance.processes):
-            # `(axes, terms, groups, n)` to `(groups, n · axes, terms)`
-            by_term = self.kernel.impedance.loading(x, order)[..., 0].movedim(1, -1).movedim(0, -2)
-            columns.append(by_term.flatten(-3, -2) @ process.offsets)
-        return torch.cat(columns, dim=-1)
+        impedance = self.kernel.impedance
+        columns = [impedance.row_loading(x, order) for order in range(len(impedance.processes))]
+        return self._by_level(torch.cat(columns, dim=-1))
+
+    def _by_level(self, by_term: Tensor) -> Tensor:
+        """Derivatives by log levels and couplings from those by the logarithms of the terms of K, D and M."""
+        offsets = [process.offsets for process in self.kernel.impedance.processes]
+        return by_term @ torch.block_diag(*offsets)
 
 
 def _level_variance(model: ForceModel, latent: Latent) -> Tensor:

@@ -6,7 +6,7 @@ predicting u. Warped impedance is conditioned in the logarithm, so its quantiles
 Levels of stiffness, damping and mass that were learned are uncertain too. Their hyperprior enters as a
 Gaussian offset b_j of each process, linearised at the fitted level: u gains Σ_j ē_j sensitivity_j b_j. So
 where ē = 0 (the equilibrium prior) the posterior of an impedance keeps the whole width of its hyperprior.
-Coupled axes: see `coupled_posterior`.
+Coupled axes are the matter of the module coupled_posterior.
 """
 
 from __future__ import annotations

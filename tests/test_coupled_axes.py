@@ -23,6 +23,7 @@ from bayes_impedance.evaluation.cross_validation import cross_validate
 from bayes_impedance.evaluation.held_out import evaluate
 from bayes_impedance.features import FeatureMap
 from bayes_impedance.identifiability import off_diagonals, summarise
+from bayes_impedance.journal import open_journal
 from bayes_impedance.kernels import ImpedanceProcess, Latent, StationaryKernel
 from bayes_impedance.kernels.coupled import join_axes
 from bayes_impedance.kernels.coupled_terms import term_directions
@@ -416,7 +417,7 @@ def test_laplace_is_the_joint_curvature_of_all_axes(trained: tuple[float, Impeda
     np.testing.assert_allclose(found, power * expected.numpy(), rtol=0.05)
 
 
-def test_more_evaluations_resume_and_refit(
+def test_sensitivity_refits_under_another_coupling(
     trained: tuple[float, ImpedanceModel], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Sensitivity refits from where the model stands, and knows the coupling as one prior among others."""
@@ -428,6 +429,22 @@ def test_more_evaluations_resume_and_refit(
     found = sensitivity.prior_sensitivity(model)
     assert set(found.refits[0].log_likelihood_change) == {"xy"}
     assert found.refits[0].effects
+
+
+def test_a_stopped_training_continues_to_the_same_bits(
+    trained: tuple[float, ImpedanceModel], tmp_path
+) -> None:
+    _, model = trained
+    results = []
+    for _ in range(2):
+        with open_journal(tmp_path / "journal") as journal:
+            fitted = clear(*TRAINING).fit(model.fitted.log, journal=journal)
+            results.append([entry.raw.detach().numpy().tobytes() for entry in fitted.hyperparameters])
+            count = len(journal)
+    assert results[0] == results[1]
+    assert count == fitted.report.restarts[0].evaluations + 2 * sum(
+        int(entry.free.sum()) * entry.raw.shape[0] for entry in fitted.hyperparameters
+    )
 
 
 def test_saved_and_loaded_model_has_the_same_bits(trained: tuple[float, ImpedanceModel], tmp_path) -> None:
@@ -525,27 +542,10 @@ def test_commands_on_a_coupled_log(tmp_path, command: Callable[..., Outcome]) ->
 # --- refusals ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("overrides", "sentence"),
-    [
-        (
-            ["model.damping={prior: gp, level: 10, sd: 2}"],
-            r"damping.prior: expected log_gp with axes: coupled, .* got gp; set model.damping.prior=log_gp",
-        ),
-        (
-            ["device.mass=2"],
-            r"device: with model.axes: coupled the Jacobian .* no closed form for; set engine.impedance=map",
-        ),
-    ],
-)
-def test_configurations_that_do_not_couple(overrides: list[str], sentence: str) -> None:
+def test_gaussian_priors_do_not_couple() -> None:
+    sentence = r"damping.prior: expected log_gp with axes: coupled, .* got gp; set model.damping.prior=log_gp"
     with pytest.raises(ConfigurationError, match=sentence):
-        load_config("coupled", overrides)
-
-
-def test_a_device_is_no_obstacle_where_no_jacobian_is_needed() -> None:
-    load_config("coupled", ["device.mass=2", "engine.impedance=map"])
-    load_config("position", ["model.axes=coupled", "device.mass=2"])
+        load_config("coupled", ["model.damping={prior: gp, level: 10, sd: 2}"])
 
 
 def test_one_axis_alone_is_refused() -> None:

@@ -121,6 +121,7 @@ KERNELS = (
 ENGINES = (
     "engines.dense",
     "engines.closed_loop",
+    "engines.coupled_loop",
     "engines.pointwise",
     "engines.given_impedance",
     "engines.given_dense",

@@ -7,10 +7,10 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any, Self, get_args
+from typing import Any, get_args
 
 import yaml
-from pydantic import BaseModel, ValidationError, model_validator
+from pydantic import BaseModel, ValidationError
 
 from bayes_impedance.config.inference import BaselineConfig, EngineConfig, TrainingConfig
 from bayes_impedance.config.log import LogConfig
@@ -34,19 +34,6 @@ class Config(Section):
     engine: EngineConfig = EngineConfig()
     training: TrainingConfig = TrainingConfig()
     baseline: BaselineConfig = BaselineConfig()
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        moments = self.engine.impedance == "moments"
-        # Around the hand itself no acceleration enters the force, and so no Jacobian.
-        answers = self.device is not None and self.model.desired_trajectory.mean != "equilibrium"
-        if self.model.axes == "coupled" and moments and answers:
-            raise ValueError(
-                "device: with model.axes: coupled the Jacobian of the closed loop is the determinant of a matrix, "
-                "which engine.impedance: moments has no closed form for; set engine.impedance=map, or "
-                "model.axes=independent, or leave device out"
-            )
-        return self
 
 
 def shipped_configurations() -> dict[str, Path]:
