@@ -160,6 +160,30 @@ def test_without_coupling_posteriors_are_those_of_independent_axes(name: str, ov
         assert np.abs(two.couplings[latent].mean).max() < 1e-20
 
 
+# --- drawn data ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("axes", [("x", "y"), ("x", "y", "z")], ids=len)
+def test_drawn_force_is_the_product_of_drawn_matrices(axes: tuple[str, ...]) -> None:
+    model = clear("model.noise_sd=1e-12")
+    log = coupled_log(model, 0.7, 0.1, axes)
+    for trial in log.trials:
+        hand = (trial.position, trial.velocity, trial.acceleration)
+        names = ("desired_position", "desired_velocity", "desired_acceleration")
+        force = np.zeros_like(trial.position)
+        for quantity, desired, actual in zip(("stiffness", "damping", "mass"), names, hand, strict=True):
+            matrices = np.empty((len(trial.time), len(axes), len(axes)))
+            for a, one in enumerate(axes):
+                for b, two in enumerate(axes):
+                    matrices[:, a, b] = trial.truth[f"{quantity}_{min(one, two)}{max(one, two)}"]
+            assert (np.linalg.eigvalsh(matrices) > 0).all()
+            error = np.stack([trial.truth[f"{desired}_{axis}"] for axis in axes], axis=1) - actual
+            force += np.einsum("nab,nb->na", matrices, error)
+        np.testing.assert_allclose(trial.force, force, rtol=1e-9, atol=1e-9)
+    # One pair of terms a pair of axes, in which the positive one is the larger by far.
+    assert all((trial.truth["stiffness_xy"] > 0).all() for trial in log.trials)
+
+
 # --- posteriors ----------------------------------------------------------------------------------
 
 
@@ -546,6 +570,16 @@ def test_gaussian_priors_do_not_couple() -> None:
     sentence = r"damping.prior: expected log_gp with axes: coupled, .* got gp; set model.damping.prior=log_gp"
     with pytest.raises(ConfigurationError, match=sentence):
         load_config("coupled", ["model.damping={prior: gp, level: 10, sd: 2}"])
+
+
+def test_no_verdict_on_a_coupling_that_was_not_learned() -> None:
+    levels = ("stiffness", "damping", "mass")
+    model = clear(*(f"model.{name}.level=10" for name in levels))
+    posterior = model.posterior(coupled_log(model, 0.5, 0.1))
+    with pytest.raises(ConfigurationError, match="expected a fitted model, got an untrained one"):
+        model.verdicts(posterior)
+    known = clear(*(f"model.{name}.{key}=1" for name in levels for key in ("level", "coupling")))
+    assert len(known.verdicts(posterior)) == 6
 
 
 def test_one_axis_alone_is_refused() -> None:

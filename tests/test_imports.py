@@ -152,7 +152,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             set(ENGINES),
             {"training"},
             {"conditioning"},
-            {"coupled_posterior"},
+            {"independent_posterior", "coupled_posterior"},
             {"posterior"},
             {
                 "identifiability",
