@@ -1,6 +1,6 @@
 """The closed loop where axes are coupled: the Jacobian of every sample is the determinant of a matrix.
 
-As in `closed_loop`, with matrices: on a device M_r ẍ + D_r ẋ = u + p the density of the forces of all axes carries
+As for independent axes, with matrices: on a device M_r ẍ + D_r ẋ = u + p the density of the forces of all axes carries
 det(I + Z M_r⁻¹) for each sample, with the apparent mass Z = M (I − ½ Δ M_r⁻¹ D_r) + ½ Δ D̄, M_r and D_r diagonal and D̄
 the damping averaged over the samples. The entries of Z are linear in the terms of M and D. With vec Z ~ N(μ, S) given
 the forces, the expectation of the n-th power of the determinant is taken by Laplace's method:
