@@ -20,7 +20,7 @@ from scipy.stats import norm
 from torch import Tensor
 
 from bayes_impedance.conditioning import Moments, select_groups
-from bayes_impedance.coupled_posterior import CoupledConditioner, LogTerms
+from bayes_impedance.coupled_posterior import CoupledConditioner, LogTerms, TermMoments
 from bayes_impedance.features import Features
 from bayes_impedance.independent_posterior import IndependentConditioner, is_warped, prior_only
 from bayes_impedance.kernels.coupled import CoupledInteractionKernel
@@ -108,7 +108,7 @@ class Posterior:
     """Posteriors of the latents at every sample of a log; immutable.
 
     `marginals[latent]` holds arrays `(samples, axes)`, samples in the order of `log`'s trials; of a matrix its
-    diagonal, as a log-normal of the same mean and variance. Where axes are coupled `couplings[latent]` holds the
+    diagonal, log-normal. Where axes are coupled `couplings[latent]` holds the
     entries beside the diagonal, `(samples, pairs)`, as Gaussians, and `terms[latent]` what the matrix is made of.
     """
 
@@ -247,8 +247,10 @@ def _coupled_posterior(
         if latent not in IMPEDANCE_ORDER:
             marginals[latent] = _marginal(model, log, target, latent, parts)
             continue
+        count = len(TermMoments._fields)
         listed = [
-            _by_sample(log, target, [(chosen, found[latent][i]) for chosen, found in terms]) for i in range(4)
+            _by_sample(log, target, [(chosen, found[latent][i]) for chosen, found in terms])
+            for i in range(count)
         ]
         matrices[latent] = LogTerms(len(log.axes), *listed)
         marginals[latent], couplings[latent] = matrix_marginals(latent, matrices[latent])
@@ -256,19 +258,9 @@ def _coupled_posterior(
 
 
 def matrix_marginals(latent: Latent, terms: LogTerms) -> tuple[Marginal, Marginal]:
-    """Entries of a matrix with the mean and variance that its terms give: diagonal log-normal, `(samples, axes)`, and
-    the others Gaussian, `(samples, pairs)`.
-    """
-    # Rounding can push the variance of a fully determined entry just below zero.
-    diagonal, other = [], []
-    rows, columns = np.triu_indices(terms.axes, 1)
-    for prior in (False, True):
-        mean, variance = terms.moments(prior)
-        centre, spread = (part.diagonal(axis1=1, axis2=2) for part in (mean, variance))
-        log_variance = np.log1p(spread.clip(min=0.0) / centre**2)
-        diagonal += [np.log(centre) - 0.5 * log_variance, np.sqrt(log_variance)]
-        other += [mean[:, rows, columns], np.sqrt(variance[:, rows, columns].clip(min=0.0))]
-    return Marginal(latent, True, *diagonal), Marginal(latent, False, *other)
+    """Marginals of the diagonal of a matrix, `(samples, axes)`, and of the entries beside it, `(samples, pairs)`."""
+    diagonal = Marginal(latent, True, *terms.diagonal(), *terms.diagonal(prior=True))
+    return diagonal, Marginal(latent, False, *terms.off_diagonal(), *terms.off_diagonal(prior=True))
 
 
 def _marginal(
