@@ -41,9 +41,12 @@ def unwarped(location: Tensor, prior_location: Tensor, variance: Tensor, prior_v
     To first order E[w|u] = E[w] (1 + a) with the shift a of log w, and E[w] = exp(location + ½ prior variance). The
     logarithm of 1 + a is replaced by its expansion below zero, where a linear estimate of w may become negative.
     """
-    a = location - prior_location
-    log = torch.where(a > 0.0, torch.log1p(a.clamp_min(0.0)), a - 0.5 * a.square())
-    return prior_location + 0.5 * (prior_variance - variance) + log
+    return prior_location + 0.5 * (prior_variance - variance) + log_shift(location - prior_location)
+
+
+def log_shift(a: Tensor) -> Tensor:
+    """log(1 + a), below zero to second order: of a linear estimate E[w] (1 + a) that may become negative."""
+    return torch.where(a > 0.0, torch.log1p(a.clamp_min(0.0)), a - 0.5 * a.square())
 
 
 def select_groups(features: Features, groups: Sequence[str]) -> Features:

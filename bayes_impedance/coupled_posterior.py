@@ -1,20 +1,23 @@
 """Posteriors where axes are coupled: the logarithms of the terms of K, D and M, jointly at each sample.
 
 Every latent is conditioned on the forces of all axes together. Levels that were learned enter as Gaussian offsets b of
-log level and log coupling (see `posterior`), of which a pair's terms take their share: g_r gains Σ_b T_rb b.
+log level and log coupling, as where axes are independent; a pair's terms take their share of them: g_r gains
+Σ_b T_rb b.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bayes_impedance.conditioning import Moments, chunks, entry_of, offset_covariance, unwarped
+from bayes_impedance.conditioning import Moments, chunks, entry_of, log_shift, offset_covariance
+from bayes_impedance.engines.coupled_loop import CoupledLoopEvidence
 from bayes_impedance.engines.dense import Factor
 from bayes_impedance.features import Features
 from bayes_impedance.kernels.coupled import CoupledInteractionKernel, by_axis, join_axes, rows_of
@@ -25,61 +28,111 @@ from bayes_impedance.training import observations
 
 Array = NDArray[np.float64]
 
-#: Location and covariance of the terms, then those of their prior: `(groups, m, terms)`, `(groups, m, terms, terms)`.
-TermMoments = tuple[Tensor, Tensor, Tensor, Tensor]
+
+class TermMoments(NamedTuple):
+    """Moments of the terms of a matrix, then those of their prior: `(groups, m, terms)`, `(groups, m, terms, terms)`.
+
+    See `LogTerms`.
+    """
+
+    expected: Tensor
+    own: Tensor
+    covariance: Tensor
+    prior_expected: Tensor
+    prior_own: Tensor
+    prior_covariance: Tensor
 
 
 @dataclass(frozen=True)
 class LogTerms:
-    """Gaussian posterior of g_r in W = Σ_r a_r a_rᵀ e^{g_r} at each sample, beside its prior.
+    """Posterior of the terms w_r = e^{g_r} of W = Σ_r a_r a_rᵀ w_r at each sample, beside its prior.
 
-    `location` `(samples, terms)`, `covariance` `(samples, terms, terms)`: of the logarithm of each term in the unit of
-    W; the terms are those of `term_directions`.
+    `expected` E[w_r] at known levels `(samples, terms)` [unit of W]; covariances of g `(samples, terms, terms)`: `own`
+    at known levels, `covariance` with the uncertainty of the levels. The terms are those of `term_directions`.
+
+    What the data tell is W and not its terms: one that is small stays uncertain by itself, and the others make up for
+    it. So W is expanded to first order in the deviations δ of g, in which this cancels as it should, and each entry has
+    the law that it would have with one term: with W̄ = Σ_r a_r a_rᵀ E[w_r] and Σ the covariance of g,
+
+        log W_aa ~ N(log W̄_aa − ½ pᵀ Σ_own p, pᵀ Σ p),   p_r = a_ra² E[w_r] / W̄_aa
+        W_ab     ~ N(W̄_ab, cᵀ Σ c),                       c_r = a_ra a_rb E[w_r]
+
+    Moments of the log-normal terms themselves would lift the diagonal by the variance of what is not known of each.
 
     Example:
-        >>> prior = np.log([[200.0, 200.0, 60.0, 60.0]]), 0.01 * np.eye(4)[None]
+        >>> prior = np.array([[200.0, 200.0, 60.0, 60.0]]), 0.01 * np.eye(4)[None], 0.01 * np.eye(4)[None]
         >>> stiffness = LogTerms(2, *prior, *prior)
-        >>> mean, variance = stiffness.moments()
-        >>> mean.round().tolist(), stiffness.draw(2, np.random.default_rng(0)).shape
-        ([[[261.0, 0.0], [0.0, 261.0]]], (2, 1, 2, 2))
+        >>> stiffness.mean().round().tolist(), stiffness.draw(2, np.random.default_rng(0)).shape
+        ([[[260.0, 0.0], [0.0, 260.0]]], (2, 1, 2, 2))
     """
 
     axes: int
-    location: Array
+    expected: Array
+    own: Array
     covariance: Array
-    prior_location: Array
+    prior_expected: Array
+    prior_own: Array
     prior_covariance: Array
 
-    def moments(self, prior: bool = False) -> tuple[Array, Array]:
-        """Mean and variance of the entries of W, `(samples, axes, axes)` each [unit of W and its square].
+    def mean(self, prior: bool = False) -> Array:
+        """W̄, `(samples, axes, axes)` [unit of W]."""
+        return np.einsum("rab,nr->nab", self._dyads(), self._of(prior)[0])
 
-        E_r = exp(μ_r + ½ Σ_rr), Cov[e^{g_r}, e^{g_s}] = E_r E_s (e^{Σ_rs} − 1).
-        """
-        location, covariance = self._gaussian(prior)
-        expected = np.exp(location + 0.5 * covariance.diagonal(axis1=1, axis2=2))
-        spread = expected[:, :, None] * expected[:, None] * np.expm1(covariance)
-        dyads = self._dyads()
-        mean = np.einsum("rab,nr->nab", dyads, expected)
-        return mean, np.einsum("rab,sab,nrs->nab", dyads, dyads, spread, optimize=True)
+    def diagonal(self, prior: bool = False) -> tuple[Array, Array]:
+        """Location and scale of log W_aa, `(samples, axes)` each."""
+        expected, own, covariance = self._of(prior)
+        centre = self.mean(prior).diagonal(axis1=1, axis2=2)
+        shares = np.einsum("raa,nr->nar", self._dyads(), expected) / centre[..., None]
+        location = np.log(centre) - 0.5 * _quadratic(shares, own)
+        # Rounding can push the variance of a fully determined entry just below zero.
+        return location, np.sqrt(_quadratic(shares, covariance).clip(min=0.0))
+
+    def off_diagonal(self, prior: bool = False) -> tuple[Array, Array]:
+        """Mean and SD of W_ab, `(samples, pairs)` each [unit of W]."""
+        expected, _, covariance = self._of(prior)
+        rows, columns = np.triu_indices(self.axes, 1)
+        slopes = np.einsum("rp,nr->npr", self._dyads()[:, rows, columns], expected)
+        return self.mean(prior)[:, rows, columns], np.sqrt(_quadratic(slopes, covariance).clip(min=0.0))
 
     def draw(self, draws: int, generator: np.random.Generator, prior: bool = False) -> Array:
-        """Matrices W, `(draws, samples, axes, axes)` [unit of W]; samples are drawn each on its own."""
-        location, covariance = self._gaussian(prior)
-        values, vectors = np.linalg.eigh(covariance)
-        # Rounding can push the variance of a fully determined direction just below zero.
-        roots = vectors * np.sqrt(values.clip(min=0.0))[:, None]
-        standard = generator.standard_normal((draws, *location.shape))
-        terms = np.exp(location + np.einsum("nrs,dns->dnr", roots, standard))
-        return np.einsum("rab,dnr->dnab", self._dyads(), terms)
+        """Matrices W, `(draws, samples, axes, axes)` [unit of W], positive definite; samples are drawn each on its own.
 
-    def _gaussian(self, prior: bool) -> tuple[Array, Array]:
+        Of the prior W = Σ_r a_r a_rᵀ e^{g_r}. Of the posterior W = L exp(X) L with L² = W̄, X = Y − ½ E[Y²], Y = Σ_r δ_r
+        P_r and P_r = L⁻¹ a_r a_rᵀ L⁻¹ E[w_r]: to first order in δ the same, for Σ_r P_r = I.
+        """
+        expected, own, covariance = self._of(prior)
+        values, vectors = np.linalg.eigh(covariance)
+        roots = vectors * np.sqrt(values.clip(min=0.0))[:, None]
+        deviation = np.einsum("nrs,dns->dnr", roots, generator.standard_normal((draws, *expected.shape)))
         if prior:
-            return self.prior_location, self.prior_covariance
-        return self.location, self.covariance
+            terms = expected * np.exp(deviation - 0.5 * own.diagonal(axis1=1, axis2=2))
+            return np.einsum("rab,dnr->dnab", self._dyads(), terms)
+        root = _function(self.mean(), np.sqrt)
+        inverse = np.linalg.inv(root)
+        parts = np.einsum("nab,rbc,ncd,nr->nrad", inverse, self._dyads(), inverse, expected, optimize=True)
+        square = np.einsum("nrs,nrab,nsbc->nac", own, parts, parts, optimize=True)
+        exponent = np.einsum("dnr,nrab->dnab", deviation, parts) - 0.5 * square
+        return root @ _function(exponent, np.exp) @ root
+
+    def _of(self, prior: bool) -> tuple[Array, Array, Array]:
+        if prior:
+            return self.prior_expected, self.prior_own, self.prior_covariance
+        return self.expected, self.own, self.covariance
 
     def _dyads(self) -> Array:
         directions: Array = term_directions(self.axes).numpy()
         return directions[:, :, None] * directions[:, None]
+
+
+def _quadratic(weights: Array, covariance: Array) -> Array:
+    """wᵀ Σ w of `weights` `(samples, …, terms)`, `(samples, …)`."""
+    return np.einsum("nar,nrs,nas->na", weights, covariance, weights, optimize=True)
+
+
+def _function(matrices: Array, function: Callable[[Array], Array]) -> Array:
+    """A function of symmetric matrices, by their eigenvalues."""
+    values, vectors = np.linalg.eigh(matrices)
+    return np.asarray((vectors * function(values)[..., None, :]) @ vectors.swapaxes(-1, -2))
 
 
 class CoupledConditioner:
@@ -96,25 +149,34 @@ class CoupledConditioner:
         self.factor: Factor | None = None
         if given is not None:
             self.inputs = self._joined(given)
-            self.factor = Factor(self.kernel, observations(model, given), jitter)
+            forces = observations(model, given)
+            self.factor = Factor(self.kernel, forces, jitter)
             self.white_loading = self.factor.whiten(self._level_loading(self.inputs))
             self.level_covariance = offset_covariance(self.white_loading, self.variance)
+            self.loop: CoupledLoopEvidence | None = None
+            if given.loop is not None:
+                self.loop = CoupledLoopEvidence(self.kernel.impedance, self.factor, forces, given.loop)
+                loading = self._by_level(self.loop.apparent.loading) - self.loop.white.mT @ self.white_loading
+                self.loop_levels = self.level_covariance @ loading.mT
+                self.loop_gain = self.loop.gain(self.loop.covariance + loading @ self.loop_levels)
 
     def moments(self, target: Features, latents: Sequence[Latent]) -> dict[Latent, Moments]:
         """Moments of latents that are no impedance, `(axes, groups, m)` each."""
-        return {
-            latent: _joined_pieces([self._latent(piece, latent) for piece in chunks(target)], dim=-1)
-            for latent in latents
-            if latent not in IMPEDANCE_ORDER
-        }
+        result: dict[Latent, Moments] = {}
+        for latent in latents:
+            if latent not in IMPEDANCE_ORDER:
+                a, b, c, d = _joined_pieces([self._latent(piece, latent) for piece in chunks(target)], dim=-1)
+                result[latent] = (a, b, c, d)
+        return result
 
     def terms(self, target: Features, latents: Sequence[Latent]) -> dict[Latent, TermMoments]:
         """Moments of the terms of each impedance."""
-        return {
-            latent: _joined_pieces([self._terms(piece, IMPEDANCE_ORDER[latent], latent) for piece in chunks(target)], 1)
-            for latent in latents
-            if latent in IMPEDANCE_ORDER
-        }  # fmt: skip
+        result: dict[Latent, TermMoments] = {}
+        for latent in latents:
+            if latent in IMPEDANCE_ORDER:
+                pieces = [self._terms(piece, IMPEDANCE_ORDER[latent], latent) for piece in chunks(target)]
+                result[latent] = TermMoments(*_joined_pieces(pieces, dim=1))
+        return result
 
     def _joined(self, features: Features) -> Tensor:
         return join_axes(features.inputs, self.kernel.impedance.layout)
@@ -137,7 +199,15 @@ class CoupledConditioner:
             location = prior_location + (cross.mT @ self.factor.alpha.unsqueeze(-1)).squeeze(-1)
             known = (own - white.square().sum(-2)).clamp_min(0.0)
             rest = loading - white.mT @ self.white_loading
-            variance = known + ((rest @ self.level_covariance) * rest).sum(-1) + noise
+            variance = known + ((rest @ self.level_covariance) * rest).sum(-1)
+            if self.loop is not None:
+                with_loop = -white.mT @ self.loop.white
+                if latent is Latent.FORCE:
+                    with_loop = with_loop + self.loop.apparent.force_covariance(x)
+                location = location + (with_loop @ self.loop.jacobian.slope.unsqueeze(-1)).squeeze(-1)
+                with_loop = with_loop + rest @ self.loop_levels
+                variance = (variance - ((with_loop @ self.loop_gain) * with_loop).sum(-1)).clamp_min(0.0)
+            variance = variance + noise
         rows = (location, variance, prior_location, prior_variance)
         a, b, c, d = (by_axis(part, self.kernel.impedance.axes) for part in rows)
         return a, b, c, d
@@ -155,33 +225,40 @@ class CoupledConditioner:
         count = len(process.shares)
         shape = (*x.shape[:-1], count)
         own = process.gaussian_covariance(x, x, diag=True).movedim(0, -1).expand(shape)
-        before, shown = process.levels.log().reshape(-1), _median_levels(self.model, process, latent).log()
+        before, shown = process.levels.reshape(-1), _median_levels(self.model, process, latent).reshape(-1)
         loading = x.new_zeros(count, len(self.variance))
         loading[:, order * count : (order + 1) * count] = process.offsets
-        prior_covariance = torch.diag_embed(own) + (loading * self.variance) @ loading.mT
+        prior_own = torch.diag_embed(own)
+        prior_covariance = prior_own + (loading * self.variance) @ loading.mT
+        mean_of_one = torch.exp(0.5 * own)
+        prior = (shown * mean_of_one, prior_own, prior_covariance)
         if self.factor is None:
-            location = before.expand(shape)
-            return location, prior_covariance, shown.reshape(-1).expand(shape), prior_covariance
+            return TermMoments(before * mean_of_one, prior_own, prior_covariance, *prior)
         cross = self.kernel.impedance.term_covariance(self.inputs, x, order)
         white = self.factor.whiten(cross)
         shift = (cross.mT @ self.factor.alpha.unsqueeze(-1)).squeeze(-1).unflatten(-1, (-1, count))
         # `(groups, m, terms, n)`
         each = white.unflatten(-1, (-1, count)).movedim(-3, -1)
-        known = torch.diag_embed(own) - each @ each.mT
+        known = prior_own - each @ each.mT
         rest = loading - each @ self.white_loading.unsqueeze(-3)
         covariance = known + rest @ self.level_covariance.unsqueeze(-3) @ rest.mT
-        variance = known.diagonal(dim1=-2, dim2=-1).clamp_min(0.0)
-        location = unwarped(before + shift, before.expand(shape), variance, own)
-        return location, covariance, shown.reshape(-1).expand(shape), prior_covariance
+        if self.loop is not None:
+            with_loop = self.loop.apparent.term_covariance(x, order) - each @ self.loop.white.unsqueeze(-3)
+            shift = shift + (with_loop @ self.loop.jacobian.slope[:, None, :, None]).squeeze(-1)
+            with_loop = with_loop + rest @ self.loop_levels.unsqueeze(-3)
+            covariance = covariance - with_loop @ self.loop_gain.unsqueeze(-3) @ with_loop.mT
+        return TermMoments(before * mean_of_one * log_shift(shift).exp(), known, covariance, *prior)
 
     def _level_loading(self, x: Tensor) -> Tensor:
         """Derivative of E[u] by the logarithms of levels and couplings of K, D and M, `(groups, n · axes, 3 terms)`."""
-        columns = []
-        for order, process in enumerate(self.kernel.impedance.processes):
-            # `(axes, terms, groups, n)` to `(groups, n · axes, terms)`
-            by_term = self.kernel.impedance.loading(x, order)[..., 0].movedim(1, -1).movedim(0, -2)
-            columns.append(by_term.flatten(-3, -2) @ process.offsets)
-        return torch.cat(columns, dim=-1)
+        impedance = self.kernel.impedance
+        columns = [impedance.row_loading(x, order) for order in range(len(impedance.processes))]
+        return self._by_level(torch.cat(columns, dim=-1))
+
+    def _by_level(self, by_term: Tensor) -> Tensor:
+        """Derivatives by log levels and couplings from those by the logarithms of the terms of K, D and M."""
+        offsets = [process.offsets for process in self.kernel.impedance.processes]
+        return by_term @ torch.block_diag(*offsets)
 
 
 def _level_variance(model: ForceModel, latent: Latent) -> Tensor:
@@ -202,6 +279,5 @@ def _median_levels(model: ForceModel, process: CoupledProcess, latent: Latent) -
     return process.levels_of(level.expand_as(process.level), coupling.expand_as(process.coupling))
 
 
-def _joined_pieces(pieces: Sequence[tuple[Tensor, Tensor, Tensor, Tensor]], dim: int) -> Moments:
-    a, b, c, d = zip(*pieces, strict=True)
-    return torch.cat(a, dim), torch.cat(b, dim), torch.cat(c, dim), torch.cat(d, dim)
+def _joined_pieces(pieces: Sequence[tuple[Tensor, ...]], dim: int) -> list[Tensor]:
+    return [torch.cat(part, dim) for part in zip(*pieces, strict=True)]

@@ -270,8 +270,11 @@ class ImpedanceModel:
             ConfigurationError: levels are to be learned and the model is not fitted: its posterior would be
                 centred wherever the hyperprior happens to be.
         """
-        impedance = (self.config.model.stiffness, self.config.model.damping, self.config.model.mass)
-        if not all(prior.level.fixed for prior in impedance):
+        model = self.config.model
+        impedance = (model.stiffness, model.damping, model.mass)
+        levels = [prior.level for prior in impedance]
+        levels += [prior.coupling for prior in impedance] if model.axes == "coupled" else []
+        if not all(level.fixed for level in levels):
             _ = self.fitted
         if posterior is None:
             posterior = self.posterior(self.fitted.log)

@@ -3,17 +3,15 @@
 The covariance between the force and another process is the primitive: predicting x_d is the same code as
 predicting u. Warped impedance is conditioned in the logarithm, so its quantiles are positive.
 
-Levels of stiffness, damping and mass that were learned are uncertain too. Their hyperprior enters as a
-Gaussian offset b_j of each process, linearised at the fitted level: u gains Σ_j ē_j sensitivity_j b_j. So
-where ē = 0 (the equilibrium prior) the posterior of an impedance keeps the whole width of its hyperprior.
-Coupled axes: see `coupled_posterior`.
+Here is what users see; the conditioning itself is that of independent_posterior or, where axes are coupled, of
+coupled_posterior.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 import pandas as pd
@@ -22,25 +20,15 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 from torch import Tensor
 
-from bayes_impedance.conditioning import (
-    Moments,
-    chunks,
-    entry_of,
-    offset_covariance,
-    select_groups,
-    unwarped,
-)
-from bayes_impedance.coupled_posterior import CoupledConditioner, LogTerms
-from bayes_impedance.engines.closed_loop import LoopEvidence
-from bayes_impedance.engines.dense import Factor
+from bayes_impedance.conditioning import Moments, select_groups
+from bayes_impedance.coupled_posterior import CoupledConditioner, LogTerms, TermMoments
 from bayes_impedance.features import Features
+from bayes_impedance.independent_posterior import IndependentConditioner, is_warped, prior_only
 from bayes_impedance.kernels.coupled import CoupledInteractionKernel
 from bayes_impedance.kernels.coupled_terms import pair_names
-from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, TRAJECTORY_ORDER, InteractionKernel, Latent
-from bayes_impedance.kernels.warped import ImpedanceProcess
+from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, InteractionKernel, Latent
 from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.priors import ForceModel
-from bayes_impedance.training import observations
 
 Array = NDArray[np.float64]
 
@@ -128,7 +116,7 @@ class Posterior:
     """Posteriors of the latents at every sample of a log; immutable.
 
     `marginals[latent]` holds arrays `(samples, axes)`, samples in the order of `log`'s trials; of a matrix its
-    diagonal, as a log-normal of the same mean and variance. Where axes are coupled `couplings[latent]` holds the
+    diagonal, log-normal. Where axes are coupled `couplings[latent]` holds the
     entries beside the diagonal, `(samples, pairs)`, as Gaussians, and `terms[latent]` what the matrix is made of.
     """
 
@@ -241,7 +229,7 @@ def compute_posterior(
     with torch.no_grad():
         if known:
             assert given is not None
-            conditioner = _Conditioner(model, select_groups(given, known), jitter)
+            conditioner = IndependentConditioner(model, select_groups(given, known), jitter)
             parts.append((known, conditioner.moments(select_groups(target, known), latents)))
         if unknown:
             parts.append((unknown, prior_only(model, select_groups(target, unknown), latents)))
@@ -267,8 +255,10 @@ def _coupled_posterior(
         if latent not in IMPEDANCE_ORDER:
             marginals[latent] = marginal_of(model, log, target, latent, parts)
             continue
+        count = len(TermMoments._fields)
         listed = [
-            by_sample(log, target, [(chosen, found[latent][i]) for chosen, found in terms]) for i in range(4)
+            by_sample(log, target, [(chosen, found[latent][i]) for chosen, found in terms])
+            for i in range(count)
         ]
         matrices[latent] = LogTerms(len(log.axes), *listed)
         marginals[latent], couplings[latent] = matrix_marginals(latent, matrices[latent])
@@ -276,166 +266,9 @@ def _coupled_posterior(
 
 
 def matrix_marginals(latent: Latent, terms: LogTerms) -> tuple[Marginal, Marginal]:
-    """Entries of a matrix with the mean and variance that its terms give: diagonal log-normal, `(samples, axes)`, and
-    the others Gaussian, `(samples, pairs)`.
-    """
-    diagonal, other = [], []
-    rows, columns = np.triu_indices(terms.axes, 1)
-    for prior in (False, True):
-        mean, variance = terms.moments(prior)
-        centre, spread = (part.diagonal(axis1=1, axis2=2) for part in (mean, variance))
-        log_variance = np.log1p(spread / centre**2)
-        diagonal += [np.log(centre) - 0.5 * log_variance, np.sqrt(log_variance)]
-        other += [mean[:, rows, columns], np.sqrt(variance[:, rows, columns])]
-    return Marginal(latent, True, *diagonal), Marginal(latent, False, *other)
-
-
-class _Conditioner:
-    """Forces given once, conditioned on for any number of targets."""
-
-    def __init__(self, model: ForceModel, given: Features, jitter: float) -> None:
-        self.model, self.given = model, given
-        forces = observations(model, given)
-        self.factor = Factor(model.kernel, forces, jitter)
-        variance = _level_variance(model)
-        self.has_levels = variance is not None
-        if variance is not None:
-            self.white_loading = self.factor.whiten(_level_loading(model, given.inputs, Latent.FORCE))
-            self.level_covariance = offset_covariance(self.white_loading, variance)
-        self.loop = None
-        if given.loop is not None:
-            self.loop = LoopEvidence(model.kernel.impedance, self.factor, forces, given.loop)
-            loading = self.loop.apparent.loading - self.loop.white.mT @ self.white_loading
-            self.loop_loading = self.level_covariance @ loading.mT
-            variance = self.loop.variance + (loading @ self.loop_loading).sum((-2, -1))
-            self.loop_gain = self.loop.gain(variance).unsqueeze(-1)
-
-    def moments(self, target: Features, latents: Sequence[Latent]) -> dict[Latent, Moments]:
-        result = {}
-        for latent in latents:
-            pieces = [self._chunk(piece, latent) for piece in chunks(target)]
-            a, b, c, d = zip(*pieces, strict=True)
-            result[latent] = tuple(torch.cat(part, dim=-1) for part in (a, b, c, d))
-        return result  # type: ignore[return-value]
-
-    def _chunk(self, target: Features, latent: Latent) -> Moments:
-        cross = _cross_covariance(self.model, self.given.inputs, target.inputs, latent)
-        white = self.factor.whiten(cross)
-        prior = _prior(self.model, target, latent)
-        # On padding α is zero.
-        location = prior.location + (cross.mT @ self.factor.alpha.unsqueeze(-1)).squeeze(-1)
-        # Rounding can push the variance of a fully determined variable just below zero.
-        known = (prior.own_variance - white.square().sum(-2)).clamp_min(0.0)
-        variance = known
-        if self.has_levels:
-            loading = prior.loading - white.mT @ self.white_loading
-            variance = variance + ((loading @ self.level_covariance) * loading).sum(-1)
-        if self.loop is not None:
-            with_loop = self.loop.covariance(target.inputs, latent, white)
-            location = location + with_loop * self.loop.jacobian.slope.unsqueeze(-1)
-            with_loop = with_loop + (loading @ self.loop_loading).squeeze(-1)
-            variance = (variance - with_loop.square() * self.loop_gain).clamp_min(0.0)
-        if _is_warped(self.model, latent):
-            location = unwarped(location, prior.location, known, prior.own_variance)
-        if latent is Latent.FORCE:
-            variance = variance + self.model.noise_variance
-        return location, variance, prior.shown.expand_as(location), prior.variance.expand_as(location)
-
-
-def _is_warped(model: ForceModel, latent: Latent) -> bool:
-    if latent not in IMPEDANCE_ORDER or not isinstance(model.kernel, InteractionKernel):
-        return False
-    process: ImpedanceProcess = model.kernel.impedance.processes[IMPEDANCE_ORDER[latent]]
-    return process.law == "log_gaussian"
-
-
-def prior_only(model: ForceModel, target: Features, latents: Sequence[Latent]) -> dict[Latent, Moments]:
-    """Moments of latents at the samples of `target` before any force."""
-    result = {}
-    shape = target.inputs.shape[:-1]
-    for latent in latents:
-        prior = _prior(model, target, latent)
-        location, variance = prior.location.expand(shape), prior.variance.expand(shape)
-        result[latent] = (location, variance, prior.shown.expand(shape), variance)
-    return result
-
-
-def _cross_covariance(model: ForceModel, x1: Tensor, x2: Tensor, latent: Latent) -> Tensor:
-    if isinstance(model.kernel, InteractionKernel):
-        return model.kernel.cross_covariance(x1, x2, latent)
-    return model.kernel(x1, x2).to_dense()
-
-
-def _own_variance(model: ForceModel, target: Features, latent: Latent) -> Tensor:
-    """Prior variance at known levels, without noise."""
-    if isinstance(model.kernel, InteractionKernel):
-        return model.kernel.prior_variance(target.inputs, latent)
-    return model.kernel(target.inputs, diag=True)
-
-
-class _Prior(NamedTuple):
-    """Prior of a latent at some samples, `(axes, groups, m)` each or what broadcasts to it.
-
-    `location` at the fitted levels, `shown` before training; `own_variance` at known levels and without noise,
-    `variance` with both; `loading` is the derivative of the location by the levels' offsets b_j.
-    """
-
-    location: Tensor
-    shown: Tensor
-    own_variance: Tensor
-    variance: Tensor
-    loading: Tensor
-
-
-def _prior(model: ForceModel, target: Features, latent: Latent) -> _Prior:
-    own = _own_variance(model, target, latent)
-    loading = _level_loading(model, target.inputs, latent)
-    levels = _level_variance(model)
-    variance = own if levels is None else own + (loading.square() * levels.unsqueeze(-2)).sum(-1)
-    if latent is Latent.FORCE:
-        location = model.prior_mean(target.inputs)
-        return _Prior(location, location, own, variance + model.noise_variance, loading)
-    if latent is Latent.RESIDUAL_FORCE:
-        location = torch.zeros_like(own)
-        return _Prior(location, location, own, variance, loading)
-    if latent in TRAJECTORY_ORDER:
-        location = target.trajectory_mean[..., TRAJECTORY_ORDER[latent]]
-        return _Prior(location, location, own, variance, loading)
-    process = model.kernel.impedance.processes[IMPEDANCE_ORDER[latent]]
-    level, median = process.level[..., 0], entry_of(model, f"{latent.value}.level").medians
-    if process.law == "log_gaussian":
-        level, median = level.log(), median.log()
-    return _Prior(level, median, own, variance, loading)
-
-
-def _level_variance(model: ForceModel) -> Tensor | None:
-    """Var[b_j], `(axes, 1, 3)`; None for a naive GP."""
-    if not isinstance(model.kernel, InteractionKernel):
-        return None
-    variances = []
-    for latent, order in IMPEDANCE_ORDER.items():
-        process = model.kernel.impedance.processes[order]
-        spec = entry_of(model, f"{latent.value}.level").specs[0]
-        log_sd = 0.0 if spec.fixed else spec.log_sd
-        level = process.level[..., 0]
-        scale = level if process.law == "gaussian" else torch.ones_like(level)
-        variances.append((scale * log_sd).square())
-    return torch.cat(variances, dim=-1)
-
-
-def _level_loading(model: ForceModel, inputs: Tensor, latent: Latent) -> Tensor:
-    """Derivative of the latent's prior location by each b_j, `(axes, groups, n, 3)`; zero for a naive GP."""
-    loading = inputs.new_zeros(*inputs.shape[:-1], len(IMPEDANCE_ORDER))
-    if latent in IMPEDANCE_ORDER:
-        loading[..., IMPEDANCE_ORDER[latent]] = 1.0
-    if latent is not Latent.FORCE or not isinstance(model.kernel, InteractionKernel):
-        return loading
-    impedance = model.kernel.impedance
-    errors = impedance.layout.errors(inputs, impedance.order)
-    if errors is not None:
-        for j, process in enumerate(impedance.processes):
-            loading[..., j] = (errors[j] * process.sensitivity(inputs)).squeeze(-1)
-    return loading
+    """Marginals of the diagonal of a matrix, `(samples, axes)`, and of the entries beside it, `(samples, pairs)`."""
+    diagonal = Marginal(latent, True, *terms.diagonal(), *terms.diagonal(prior=True))
+    return diagonal, Marginal(latent, False, *terms.off_diagonal(), *terms.off_diagonal(prior=True))
 
 
 def marginal_of(
@@ -446,7 +279,7 @@ def marginal_of(
     # `(groups, m, axes, 4)`
     batches = [(groups, torch.stack(moments[latent]).permute(2, 3, 1, 0)) for groups, moments in parts]
     location, variance, prior_location, prior_variance = np.moveaxis(by_sample(log, target, batches), -1, 0)
-    warped = _is_warped(model, latent)
+    warped = is_warped(model, latent)
     return Marginal(latent, warped, location, np.sqrt(variance), prior_location, np.sqrt(prior_variance))
 
 

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from bayes_impedance.config import TrainingConfig
 from bayes_impedance.engines.closed_loop import log_likelihood
+from bayes_impedance.engines.coupled_loop import coupled_log_likelihood
 from bayes_impedance.engines.dense import Observations
 from bayes_impedance.errors import NotPositiveDefiniteError
 from bayes_impedance.features import Features
@@ -97,9 +98,10 @@ def log_evidence(model: ForceModel, features: Features, jitter: float) -> Tensor
     Raises:
         NotPositiveDefiniteError: no Cholesky factor at this jitter.
     """
-    return (
-        log_likelihood(model.kernel, observations(model, features), features.loop, jitter).sum(-1).reshape(-1)
-    )
+    given, loop = observations(model, features), features.loop
+    if model.is_coupled and loop is not None:
+        return coupled_log_likelihood(model.kernel, given, loop, jitter).sum(-1).reshape(-1)
+    return log_likelihood(model.kernel, given, loop, jitter).sum(-1).reshape(-1)
 
 
 def objective(model: ForceModel, features: Features, jitter: float) -> tuple[Tensor, Tensor]:

@@ -23,6 +23,7 @@ from bayes_impedance.evaluation.cross_validation import cross_validate
 from bayes_impedance.evaluation.held_out import evaluate
 from bayes_impedance.features import FeatureMap
 from bayes_impedance.identifiability import off_diagonals, summarise
+from bayes_impedance.journal import open_journal
 from bayes_impedance.kernels import ImpedanceProcess, Latent, StationaryKernel
 from bayes_impedance.kernels.coupled import join_axes
 from bayes_impedance.kernels.coupled_terms import term_directions
@@ -159,6 +160,30 @@ def test_without_coupling_posteriors_are_those_of_independent_axes(name: str, ov
         assert np.abs(two.couplings[latent].mean).max() < 1e-20
 
 
+# --- drawn data ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("axes", [("x", "y"), ("x", "y", "z")], ids=len)
+def test_drawn_force_is_the_product_of_drawn_matrices(axes: tuple[str, ...]) -> None:
+    model = clear("model.noise_sd=1e-12")
+    log = coupled_log(model, 0.7, 0.1, axes)
+    for trial in log.trials:
+        hand = (trial.position, trial.velocity, trial.acceleration)
+        names = ("desired_position", "desired_velocity", "desired_acceleration")
+        force = np.zeros_like(trial.position)
+        for quantity, desired, actual in zip(("stiffness", "damping", "mass"), names, hand, strict=True):
+            matrices = np.empty((len(trial.time), len(axes), len(axes)))
+            for a, one in enumerate(axes):
+                for b, two in enumerate(axes):
+                    matrices[:, a, b] = trial.truth[f"{quantity}_{min(one, two)}{max(one, two)}"]
+            assert (np.linalg.eigvalsh(matrices) > 0).all()
+            error = np.stack([trial.truth[f"{desired}_{axis}"] for axis in axes], axis=1) - actual
+            force += np.einsum("nab,nb->na", matrices, error)
+        np.testing.assert_allclose(trial.force, force, rtol=1e-9, atol=1e-9)
+    # One pair of terms a pair of axes, in which the positive one is the larger by far.
+    assert all((trial.truth["stiffness_xy"] > 0).all() for trial in log.trials)
+
+
 # --- posteriors ----------------------------------------------------------------------------------
 
 
@@ -168,28 +193,76 @@ def posterior(request: pytest.FixtureRequest) -> Posterior:
     return model.posterior(coupled_log(model, 0.6, 0.1, request.param))
 
 
-def test_posterior_of_matrices_has_the_moments_of_drawn_terms(posterior: Posterior) -> None:
-    """Log-normals of the width of the hyperpriors have no fourth moment to speak of: the posterior alone is drawn."""
-    draws = 20_000
+def sum_of_terms(terms: LogTerms, draws: int) -> np.ndarray:
+    """Σ_r a_r a_rᵀ e^{g_r} with g drawn, `(draws, samples, axes, axes)`."""
     generator = np.random.default_rng(0)
-    rows = slice(0, 5)
+    directions = term_directions(terms.axes).numpy()
+    location = np.log(terms.expected) - 0.5 * terms.covariance.diagonal(axis1=1, axis2=2)
+    g = np.stack(
+        [
+            generator.multivariate_normal(mean, covariance, size=draws, method="eigh")
+            for mean, covariance in zip(location, terms.covariance, strict=True)
+        ],
+        axis=1,
+    )
+    return np.einsum("ra,rb,dnr->dnab", directions, directions, np.exp(g))
+
+
+def narrowed(terms: LogTerms, factor: float, rows: slice) -> LogTerms:
+    """Some samples, with covariances so much smaller."""
+    return LogTerms(
+        terms.axes,
+        terms.expected[rows],
+        factor * terms.own[rows],
+        factor * terms.covariance[rows],
+        terms.prior_expected[rows],
+        terms.prior_own[rows],
+        terms.prior_covariance[rows],
+    )
+
+
+def test_moments_of_matrices_are_those_of_drawn_terms_to_first_order(posterior: Posterior) -> None:
+    """With SDs a hundredth of theirs, so that what is of second order in them is a few hundredths of an SD."""
+    draws = 40_000
     for latent in IMPEDANCE_ORDER:
-        terms = posterior.terms[latent]
-        few = replace(terms, location=terms.location[rows], covariance=terms.covariance[rows])
-        drawn = few.draw(draws, generator)
-        mean, variance = (part[rows] for part in terms.moments())
-        error = drawn.std(0) / math.sqrt(draws)
-        assert np.all(np.abs(drawn.mean(0) - mean) < 5.0 * error)
-        spread = np.square(drawn - drawn.mean(0))
-        assert np.all(np.abs(spread.mean(0) - variance) < 5.0 * spread.std(0) / math.sqrt(draws))
+        terms = narrowed(posterior.terms[latent], 1e-4, slice(0, 4))
+        drawn = sum_of_terms(terms, draws)
+        diagonal, coupling = matrix_marginals(latent, terms)
+        axes, upper = range(len(posterior.axes)), np.triu_indices(len(posterior.axes), 1)
+        for marginal, values in ((diagonal, drawn[:, :, axes, axes]), (coupling, drawn[:, :, *upper])):
+            assert np.all(
+                np.abs(values.mean(0) - marginal.mean) < (5.0 / math.sqrt(draws) + 0.05) * marginal.sd
+            )
+            # An SD from so many draws is right to 1/√(2 draws), five times that and the second order.
+            np.testing.assert_allclose(values.std(0), marginal.sd, rtol=5.0 / math.sqrt(2.0 * draws) + 0.05)
+
+
+def test_drawn_posteriors_have_the_reported_moments(posterior: Posterior) -> None:
+    draws = 20_000
+    for latent in IMPEDANCE_ORDER:
+        terms = narrowed(posterior.terms[latent], 1e-4, slice(0, 4))
+        drawn = terms.draw(draws, np.random.default_rng(1))
         assert (np.linalg.eigvalsh(drawn) > 0).all()
-        # What is reported has these moments.
-        axes = range(len(posterior.axes))
-        np.testing.assert_allclose(posterior[latent].mean[rows], mean[:, axes, axes], rtol=1e-10)
-        np.testing.assert_allclose(posterior[latent].sd[rows] ** 2, variance[:, axes, axes], rtol=1e-9)
-        upper = np.triu_indices(len(posterior.axes), 1)
-        np.testing.assert_allclose(posterior.couplings[latent].mean[rows], mean[:, *upper], rtol=1e-12)
-        np.testing.assert_allclose(posterior.couplings[latent].sd[rows] ** 2, variance[:, *upper], rtol=1e-10)
+        diagonal, coupling = matrix_marginals(latent, terms)
+        axes, upper = range(len(posterior.axes)), np.triu_indices(len(posterior.axes), 1)
+        for marginal, values in ((diagonal, drawn[:, :, axes, axes]), (coupling, drawn[:, :, *upper])):
+            assert np.all(
+                np.abs(values.mean(0) - marginal.mean) < (5.0 / math.sqrt(draws) + 0.05) * marginal.sd
+            )
+            np.testing.assert_allclose(values.std(0), marginal.sd, rtol=5.0 / math.sqrt(2.0 * draws) + 0.05)
+
+
+def test_drawn_priors_are_sums_of_log_normal_terms() -> None:
+    expected = np.array([[200.0, 150.0, 60.0, 40.0]])
+    spread = np.diag([0.1, 0.2, 0.05, 0.08])[None]
+    terms = LogTerms(2, expected, spread, spread, expected, spread, spread)
+    drawn = terms.draw(100_000, np.random.default_rng(0), prior=True)
+    # E[w_r] are the means, and Var[w_r] = E[w_r]² (e^{σ²} − 1).
+    assert abs(drawn[:, 0, 0, 0].mean() - 250.0) < 5.0 * drawn[:, 0, 0, 0].std() / math.sqrt(100_000)
+    variance = np.square(expected[0]) * np.expm1(np.diag(spread[0]))
+    assert drawn[:, 0, 0, 1].mean() == pytest.approx(10.0, abs=0.3)
+    assert drawn[:, 0, 0, 1].var() == pytest.approx((variance[2] + variance[3]) / 4.0, rel=0.03)
+    assert drawn[:, 0, 1, 1].var() == pytest.approx(variance[1] + (variance[2] + variance[3]) / 4.0, rel=0.05)
 
 
 @pytest.mark.parametrize("prior", [False, True])
@@ -202,7 +275,7 @@ def test_drawn_matrices_are_positive_definite_and_seeded(posterior: Posterior, p
     assert not np.array_equal(drawn, draw_matrices(posterior, 7, seed=4, prior=prior))
     median = np.median(drawn[:, :, 0, 0, 0], axis=0)
     shown = posterior["stiffness"].prior_quantile(0.5) if prior else posterior["stiffness"].quantile(0.5)
-    # Seven draws of log-SD 1.4 or less: their median is within a factor of eight.
+    # Seven draws of log-SD one or so: their median is within a factor of eight.
     assert np.all(np.abs(np.log(median / shown[:, 0])) < math.log(8.0))
 
 
@@ -299,24 +372,21 @@ def test_latents_are_conditioned_on_forces_of_all_axes() -> None:
         )
 
 
-def test_terms_match_their_closed_moments_in_a_case_by_hand() -> None:
-    """K = a₊a₊ᵀ e^{g₊} + a₋a₋ᵀ e^{g₋} with correlated g: K_xy = ½ (e^{g₊} − e^{g₋})."""
-    location = np.array([[-60.0, -60.0, 1.0, 0.5]])
+def test_what_the_data_leave_to_each_term_is_not_added_to_the_matrix() -> None:
+    """Two terms that are uncertain apart and certain together: the diagonal is certain, and not lifted."""
+    expected = np.array([[1e-30, 1e-30, 30.0, 20.0]])
     covariance = np.zeros((1, 4, 4))
-    covariance[0, 2:, 2:] = [[0.09, -0.03], [-0.03, 0.04]]
-    terms = LogTerms(2, location, covariance, location, covariance)
-    plus, minus = math.exp(1.045), math.exp(0.52)
-    v_plus, v_minus = plus**2 * math.expm1(0.09), minus**2 * math.expm1(0.04)
-    shared = plus * minus * math.expm1(-0.03)
-    mean, variance = terms.moments()
-    np.testing.assert_allclose(
-        mean[0], [[(plus + minus) / 2, (plus - minus) / 2], [(plus - minus) / 2, (plus + minus) / 2]]
-    )
-    np.testing.assert_allclose(variance[0, 0, 1], (v_plus + v_minus - 2 * shared) / 4)
-    np.testing.assert_allclose(variance[0, 0, 0], (v_plus + v_minus + 2 * shared) / 4)
+    # 30 δ₊ + 20 δ₋ = 0, and both have SDs of about one.
+    direction = np.array([2.0, -3.0]) / 3.0
+    covariance[0, 2:, 2:] = np.outer(direction, direction)
+    terms = LogTerms(2, expected, covariance, covariance, expected, covariance, covariance)
     diagonal, coupling = matrix_marginals(Latent.STIFFNESS, terms)
+    np.testing.assert_allclose(diagonal.mean, [[25.0, 25.0]], rtol=1e-12)
+    np.testing.assert_allclose(diagonal.scale, 0.0, atol=1e-7)
+    np.testing.assert_allclose(coupling.mean, [[5.0]], rtol=1e-12)
+    # ½ (30 · ⅔ + 20 · 1)
+    np.testing.assert_allclose(coupling.sd, [[20.0]], rtol=1e-12)
     assert (diagonal.warped, coupling.warped) == (True, False)
-    assert len(term_directions(2)) == 4
 
 
 def test_groups_without_evidence_keep_their_prior() -> None:
@@ -328,7 +398,7 @@ def test_groups_without_evidence_keep_their_prior() -> None:
     own = found.trial_slice(3)
     for marginal in (found["stiffness"], found.couplings[Latent.STIFFNESS]):
         np.testing.assert_allclose(marginal.scale[own], marginal.prior_scale[own])
-        assert (marginal.scale[: own.start] < 0.5 * marginal.prior_scale[: own.start]).all()
+        assert (marginal.scale[: own.start] < 0.75 * marginal.prior_scale[: own.start]).all()
     np.testing.assert_allclose(found["stiffness"].location[own], found["stiffness"].prior_location[own])
 
 
@@ -416,7 +486,7 @@ def test_laplace_is_the_joint_curvature_of_all_axes(trained: tuple[float, Impeda
     np.testing.assert_allclose(found, power * expected.numpy(), rtol=0.05)
 
 
-def test_more_evaluations_resume_and_refit(
+def test_sensitivity_refits_under_another_coupling(
     trained: tuple[float, ImpedanceModel], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Sensitivity refits from where the model stands, and knows the coupling as one prior among others."""
@@ -428,6 +498,22 @@ def test_more_evaluations_resume_and_refit(
     found = sensitivity.prior_sensitivity(model)
     assert set(found.refits[0].log_likelihood_change) == {"xy"}
     assert found.refits[0].effects
+
+
+def test_a_stopped_training_continues_to_the_same_bits(
+    trained: tuple[float, ImpedanceModel], tmp_path
+) -> None:
+    _, model = trained
+    results = []
+    for _ in range(2):
+        with open_journal(tmp_path / "journal") as journal:
+            fitted = clear(*TRAINING).fit(model.fitted.log, journal=journal)
+            results.append([entry.raw.detach().numpy().tobytes() for entry in fitted.hyperparameters])
+            count = len(journal)
+    assert results[0] == results[1]
+    assert count == fitted.report.restarts[0].evaluations + 2 * sum(
+        int(entry.free.sum()) * entry.raw.shape[0] for entry in fitted.hyperparameters
+    )
 
 
 def test_saved_and_loaded_model_has_the_same_bits(trained: tuple[float, ImpedanceModel], tmp_path) -> None:
@@ -525,27 +611,20 @@ def test_commands_on_a_coupled_log(tmp_path, command: Callable[..., Outcome]) ->
 # --- refusals ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("overrides", "sentence"),
-    [
-        (
-            ["model.damping={prior: gp, level: 10, sd: 2}"],
-            r"damping.prior: expected log_gp with axes: coupled, .* got gp; set model.damping.prior=log_gp",
-        ),
-        (
-            ["device.mass=2"],
-            r"device: with model.axes: coupled the Jacobian .* no closed form for; set engine.impedance=map",
-        ),
-    ],
-)
-def test_configurations_that_do_not_couple(overrides: list[str], sentence: str) -> None:
+def test_gaussian_priors_do_not_couple() -> None:
+    sentence = r"damping.prior: expected log_gp with axes: coupled, .* got gp; set model.damping.prior=log_gp"
     with pytest.raises(ConfigurationError, match=sentence):
-        load_config("coupled", overrides)
+        load_config("coupled", ["model.damping={prior: gp, level: 10, sd: 2}"])
 
 
-def test_a_device_is_no_obstacle_where_no_jacobian_is_needed() -> None:
-    load_config("coupled", ["device.mass=2", "engine.impedance=map"])
-    load_config("position", ["model.axes=coupled", "device.mass=2"])
+def test_no_verdict_on_a_coupling_that_was_not_learned() -> None:
+    levels = ("stiffness", "damping", "mass")
+    model = clear(*(f"model.{name}.level=10" for name in levels))
+    posterior = model.posterior(coupled_log(model, 0.5, 0.1))
+    with pytest.raises(ConfigurationError, match="expected a fitted model, got an untrained one"):
+        model.verdicts(posterior)
+    known = clear(*(f"model.{name}.{key}=1" for name in levels for key in ("level", "coupling")))
+    assert len(known.verdicts(posterior)) == 6
 
 
 def test_one_axis_alone_is_refused() -> None:

@@ -121,6 +121,7 @@ KERNELS = (
 ENGINES = (
     "engines.dense",
     "engines.closed_loop",
+    "engines.coupled_loop",
     "engines.pointwise",
     "engines.given_impedance",
     "engines.given_dense",
@@ -185,7 +186,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             IMPEDANCE_FUNCTIONS,
             {"training"},
             {"conditioning"},
-            {"coupled_posterior"},
+            {"independent_posterior", "coupled_posterior"},
             {"posterior"},
             set(FITTED_FUNCTIONS),
             {

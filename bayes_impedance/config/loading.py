@@ -37,15 +37,6 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        moments = self.engine.impedance == "moments"
-        # Around the hand itself no acceleration enters the force, and so no Jacobian.
-        answers = self.device is not None and self.model.desired_trajectory.mean != "equilibrium"
-        if self.model.axes == "coupled" and moments and answers:
-            raise ValueError(
-                "device: with model.axes: coupled the Jacobian of the closed loop is the determinant of a matrix, "
-                "which engine.impedance: moments has no closed form for; set engine.impedance=map, or "
-                "model.axes=independent, or leave device out"
-            )
         for complaint in (_moments_only(self), _map_only(self)):
             if complaint is not None:
                 raise ValueError(complaint)

@@ -91,7 +91,7 @@ class ApparentMass:
         _, self._damping, mass = impedance.processes
         self._half_step = 0.5 * loop.step
         self._mass_share = 1.0 - self._half_step * loop.device_damping / loop.device_mass
-        self._anchors = _spread(observations)
+        self._anchors = spread(observations.inputs, observations.count)
         half, damping = self._half_step, self._damping
         self.mean = self._mass_share * mass.level[..., 0, 0] + half * damping.expectation(self._anchors).mean(
             (-2, -1)
@@ -150,11 +150,10 @@ class LoopEvidence:
         return self.jacobian.curvature / (1.0 + self.jacobian.curvature * variance)
 
 
-def _spread(observations: Observations) -> Tensor:
-    """Some inputs, spread evenly over the samples that are no padding, `(*batch, anchors, D)`."""
-    inputs = observations.inputs
+def spread(inputs: Tensor, count: Tensor) -> Tensor:
+    """Some inputs, spread evenly over the `count` samples that are no padding, `(*batch, anchors, D)`."""
     n = inputs.shape[-2]
     share = torch.linspace(0.0, 1.0, min(n, ANCHORS), dtype=inputs.dtype)
-    rows = ((observations.count.unsqueeze(-1) - 1.0) * share).round().long()
+    rows = ((count.unsqueeze(-1) - 1.0) * share).round().long()
     rows = rows.expand(*inputs.shape[:-2], share.numel()).unsqueeze(-1)
     return inputs.gather(-2, rows.expand(*rows.shape[:-1], inputs.shape[-1]))

@@ -230,6 +230,11 @@ class CoupledImpedanceKernel(Kernel):
         along = contract(process.directions, errors[order]) * expected
         return process.directions.mT.reshape(self.axes, -1, *[1] * (along.ndim - 1)) * along
 
+    def row_loading(self, x: Tensor, order: int, weights: Tensor | float = 1.0) -> Tensor:
+        """`loading` times `weights` `(terms, *batch, n, 1)`, rows as in a covariance: `(*batch, n · axes, terms)`."""
+        blocks = (self.loading(x, order) * weights)[..., 0]
+        return blocks.movedim(1, -1).movedim(0, -2).flatten(-3, -2)
+
     def term_covariance(self, x1: Tensor, x2: Tensor, order: int) -> Tensor:
         """Cov[u_a, g_jr'], j = `order`: `loading` times k_r, `(*batch, n1 · axes, n2 · terms)` [N]."""
         product = self.loading(x1, order) * self.processes[order].gaussian_covariance(x1, x2)

@@ -32,6 +32,7 @@ CASES = {
         "desired_trajectory": {"mean": "equilibrium", "sd": 0.02},
     },
     "position_velocity": {"trajectory_input": "position_velocity"},
+    "no acceleration": {"trajectory_input": "position_velocity", "drop_acceleration": True},
     "time": {"trajectory_input": "time", "residual": None},
 }
 
