@@ -74,11 +74,13 @@ def build_engine(
 
     Raises:
         ConfigurationError: it cannot hold the processes.
+        TooManySamplesError: it is dense, and the samples are too many.
     """
     if name == "markov":
         return markov.MarkovEngine(features, processes, coupled)
     if name == "lowrank":
         return lowrank.LowRankEngine(features, coupled)
+    _check_dense(config, processes, features, coupled)
     return DenseGivenImpedance(features, coupled, config.jitter)
 
 
