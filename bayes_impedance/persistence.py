@@ -166,7 +166,8 @@ def _check_functions(config: Config, model: ForceModel, functions: FittedFunctio
         return
     size, free = expected_sizes(config, model, functions)
     arrays = (functions.point, (size,)), (functions.covariance, (free, free))
-    if any(array.shape != shape or array.dtype != np.float64 for array, shape in arrays):
+    wrong = any(array.shape != shape or array.dtype != np.float64 for array, shape in arrays)
+    if wrong or any(own is not None and own.dtype != torch.float64 for own in functions.inducing):
         raise ValueError("functions of another shape or type")
 
 
