@@ -45,6 +45,10 @@ from bayes_impedance.sensitivity import Sensitivity, prior_sensitivity
 from bayes_impedance.writer import check_table_name, write_table
 
 BAD_INPUT, INTERRUPTED = 2, 130
+#: Beside "nothing to resume".
+KEEPS_NOTHING = (
+    ", for engine.impedance: map finds functions anew and keeps nothing of a training that was stopped"
+)
 
 
 class _Commands(typer.core.TyperGroup):
@@ -202,16 +206,23 @@ def train(
 
     Ctrl-C stops early and keeps the best found so far. What was computed is kept beside the model until training has
     ended: after Ctrl-C, a crash or a power cut the same command with --resume continues, and ends with the same model.
+    Where impedance is a function (engine.impedance: map) nothing is kept: Ctrl-C keeps the best restart that has ended.
     """
     console = Console()
     settings = load_config(config, overrides or [])
+    anew = settings.engine.impedance == "map"
     check_writable(out)
     check_replaceable(out, METADATA)
     with open_journal(_journal_of(out)) as journal:
-        if journal and not resume:
+        if journal and not resume and not anew:
             raise OutputError(
                 f"{journal.path}: expected no unfinished training of {out.name}, found one with {len(journal)} "
                 "evaluations; add --resume to continue it, or delete the file to start anew"
+            )
+        if journal and anew:
+            raise OutputError(
+                f"{journal.path}: expected no unfinished training of {out.name}, which engine.impedance: map could not "
+                f"continue, found one with {len(journal)} evaluations; delete the file, or train with another --out"
             )
         log = read_log(logs, settings.log)
         model = ImpedanceModel(settings)
@@ -224,10 +235,10 @@ def train(
             console.print(
                 f"continuing after {len(journal)} evaluations"
                 if journal
-                else "nothing to resume: training from the start"
+                else f"nothing to resume{KEEPS_NOTHING if anew else ''}: training from the start"
             )
         with terminal.training_progress(console, settings.training, "training") as progress:
-            model = model.fit(prepared, progress, journal=journal)
+            model = model.fit(prepared, progress, journal=None if anew else journal)
         console.print(str(model.engine), highlight=False, soft_wrap=True)
         save_model(model, out)
         if not model.report.interrupted:
@@ -239,8 +250,12 @@ def train(
     )
     if model.report.interrupted:
         console.print(
-            "training was interrupted: the model holds the best hyperparameters found until then; to continue, add "
-            "--resume to the same command",
+            "training was interrupted: the model holds the best hyperparameters found until then; "
+            + (
+                "to train in full, repeat the same command"
+                if anew
+                else "to continue, add --resume to the same command"
+            ),
             soft_wrap=True,
         )
         raise typer.Exit(INTERRUPTED)

@@ -139,7 +139,7 @@ class ImpedanceModel:
 
         The first restart begins at the values of `start`, a fitted model with the same hyperparameters, where one is
         given; such a refit has no Laplace approximation. `journal` keeps every evaluation, and a training that was
-        killed continues from it to the same bits.
+        killed continues from it to the same bits. Where impedance is a function there is neither.
 
         Raises:
             LogError, ConfigurationError, TooManySamplesError, NotPositiveDefiniteError.
@@ -152,6 +152,7 @@ class ImpedanceModel:
             raise LogError("expected a log with force to train on, found none; name log.columns.force")
         force_model = build_force_model(self.config, feature_map)
         if self._is_function:
+            _check_anew(start, journal)
             functions, report = train_functions(self.config, force_model, features, progress)
             return ImpedanceModel(self.config, Fit(force_model, prepared, report, functions))
         self._check_capacity(prepared)
@@ -380,3 +381,13 @@ class ImpedanceModel:
         for group in log.groups:
             n = sum(int(trial.observed.sum()) for trial in log.trials if trial.group == group)
             check_capacity(coupled * n, self.config.engine.max_samples, f"group '{group}'{counted}")
+
+
+def _check_anew(start: ImpedanceModel | None, journal: Journal | None) -> None:
+    """Functions are found from their prior mean, every time."""
+    for name, given in (("start", start), ("journal", journal)):
+        if given is not None:
+            raise ConfigurationError(
+                f"{name}: expected none with engine.impedance: map, which finds functions anew each time, got one; "
+                "leave it out, or set engine.impedance=moments"
+            )

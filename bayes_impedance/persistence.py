@@ -26,15 +26,15 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
-from bayes_impedance.config import dump_config, load_config
+from bayes_impedance.config import Config, dump_config, load_config
 from bayes_impedance.engines.choice import EngineChoice
 from bayes_impedance.errors import BayesImpedanceError, ModelFolderError
 from bayes_impedance.features import FeatureMap
-from bayes_impedance.impedance_functions.train import FittedFunctions
+from bayes_impedance.impedance_functions.train import FittedFunctions, expected_sizes
 from bayes_impedance.model import Fit, ImpedanceModel
 from bayes_impedance.outputs import whole_folder
 from bayes_impedance.preprocessing import PreparedLog
-from bayes_impedance.priors import build_force_model
+from bayes_impedance.priors import ForceModel, build_force_model
 from bayes_impedance.training import RestartReport, TrainingReport
 
 Array = NDArray[np.float64]
@@ -154,8 +154,21 @@ def _assemble(place: Path, metadata: Mapping[str, Any]) -> ImpedanceModel:
     functions = None
     if metadata.get("functions"):
         functions = _functions(metadata["functions"], load_file(place / FUNCTIONS))
+    _check_functions(config, force_model, functions)
     training = TrainingReport(**{**report, **lists, "restarts": restarts})
     return ImpedanceModel(config, Fit(force_model, log, training, functions))
+
+
+def _check_functions(config: Config, model: ForceModel, functions: FittedFunctions | None) -> None:
+    if (config.engine.impedance == "map") != (functions is not None):
+        raise ValueError("engine.impedance: map without functions, or functions without it")
+    if functions is None:
+        return
+    size, free = expected_sizes(config, model, functions)
+    arrays = (functions.point, (size,)), (functions.covariance, (free, free))
+    wrong = any(array.shape != shape or array.dtype != np.float64 for array, shape in arrays)
+    if wrong or any(own is not None and own.dtype != torch.float64 for own in functions.inducing):
+        raise ValueError("functions of another shape or type")
 
 
 def _function_header(functions: FittedFunctions) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 from bayes_impedance.config import Config, Hyperparameter, replace_value
 from bayes_impedance.config.model import LARGEST_LOG_SD
 from bayes_impedance.config.sections import LARGEST_HYPERPRIOR_LOG_SD
-from bayes_impedance.errors import NotPositiveDefiniteError
+from bayes_impedance.errors import ConfigurationError, NotPositiveDefiniteError
 from bayes_impedance.identifiability import Support
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
 from bayes_impedance.model import ImpedanceModel
@@ -170,11 +170,16 @@ def prior_sensitivity(model: ImpedanceModel, progress: Progress | None = None) -
     Refits start at the model's optimum, with its training settings and no restarts. Ctrl-C ends it.
 
     Raises:
-        ConfigurationError: the model is not fitted.
+        ConfigurationError: the model is not fitted, or impedance is a function.
         NotPositiveDefiniteError: the model does not refit under its own priors.
     Source: power-scaling of priors, Kallioinen, Paananen, Bürkner, Vehtari (Statistics and Computing 34:57, 2024).
     """
     planned = changes(model.hyperparameters)
+    if model.config.engine.impedance == "map":
+        raise ConfigurationError(
+            "expected engine.impedance: moments for prior sensitivity, whose refits start at the hyperparameters that "
+            "were found, got map; train with engine.impedance=moments, or train again with one prior changed by --set"
+        )
     base = _conclude(_refit(model, model.config))
     refits = []
     for done, change in enumerate(planned):

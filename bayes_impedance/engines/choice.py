@@ -46,7 +46,9 @@ def choose_engine(
     if config.name in ("markov", "lowrank"):
         refusal = _refusal(config.name, processes, features, coupled)
         if refusal is not None:
-            raise ConfigurationError(refusal)
+            raise ConfigurationError(
+                f"engine.name: expected an engine that holds this model, got {config.name}: {refusal}"
+            )
     if config.name != "auto":
         return EngineChoice(config.name, "asked for by engine.name")
     not_markov = _refusal("markov", processes, features, coupled)
@@ -74,18 +76,21 @@ def build_engine(
 
     Raises:
         ConfigurationError: it cannot hold the processes.
+        TooManySamplesError: it is dense, and the samples are too many.
     """
     if name == "markov":
         return markov.MarkovEngine(features, processes, coupled)
     if name == "lowrank":
         return lowrank.LowRankEngine(features, coupled)
+    _check_dense(config, processes, features, coupled)
     return DenseGivenImpedance(features, coupled, config.jitter)
 
 
 def _refusal(name: str, processes: Processes, features: Features, coupled: bool) -> str | None:
-    if name == "markov":
-        return markov.unsupported(processes, features, coupled)
-    return lowrank.unsupported(processes, features, coupled)
+    """Why that engine cannot hold the processes, without the key that chooses it; None where it can."""
+    unsupported = markov.unsupported if name == "markov" else lowrank.unsupported
+    reason = unsupported(processes, features, coupled)
+    return None if reason is None else reason.removeprefix("engine.name: ")
 
 
 def _check_dense(config: EngineConfig, processes: Processes, features: Features, coupled: bool) -> None:

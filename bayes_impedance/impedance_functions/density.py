@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bayes_impedance.device import Loop
-from bayes_impedance.engines.given_impedance import ConditionalEngine, Processes, diagonal_only
+from bayes_impedance.engines.given_impedance import ConditionalEngine, Processes
 from bayes_impedance.errors import NotPositiveDefiniteError
 from bayes_impedance.features import Features
 from bayes_impedance.impedance_functions.function import ImpedanceFunction
@@ -18,6 +18,8 @@ from bayes_impedance.priors import Entry, ForceModel
 
 Array = NDArray[np.float64]
 
+#: What steps away from the anchor cost: a hyperprior of this SD, in unconstrained values.
+TRUSTED = 2.0
 #: Hyperparameters of the impedance's own priors: functions carry their levels, and evidence finds the others.
 OF_IMPEDANCE = ("stiffness.", "damping.", "mass.")
 
@@ -40,11 +42,19 @@ class Designs:
         return torch.stack([function.matrices(design, own) for function, design, own in parts], dim=2)
 
 
+def beside_impedance(model: ForceModel) -> list[Entry]:
+    """Learned hyperparameters of desired trajectory, residual force and noise."""
+    return [
+        entry for entry in model.entries if bool(entry.free.any()) and not entry.name.startswith(OF_IMPEDANCE)
+    ]
+
+
 def log_jacobian(loop: Loop, impedance: Tensor, valid: Tensor | None, coupled: bool) -> Tensor:
     """Σ_n log det ∂(u − Σ_j W_j e^{(j)})/∂u of a closed loop, `(axes, groups)` or `(1, groups)` [nats].
 
     On a device that answers force, M_r ẍ + D_r ẋ = u + p, the matrix is I + Z M_r⁻¹ with the apparent mass
-    Z = M (I − ½ Δ D_r M_r⁻¹) + ½ Δ D, Δ the time between samples (docs/model.md §6).
+    Z = M (I − ½ Δ D_r M_r⁻¹) + ½ Δ D, Δ the time between samples (docs/model.md §6). Axes that do not couple have the
+    diagonal of it.
     """
     _, damping, mass = impedance.unbind(2)
     step = loop.step[:, None, None, None]
@@ -78,11 +88,7 @@ class Density:
     ) -> None:
         self.model, self.functions, self.engine, self.features = model, functions, engine, features
         self.coupled, self.periodic = coupled, periodic
-        self.entries = [
-            entry
-            for entry in model.entries
-            if bool(entry.free.any()) and not entry.name.startswith(OF_IMPEDANCE)
-        ]
+        self.entries = beside_impedance(model)
         groups = features.inputs.shape[1]
         self.shapes = [(groups, len(f.places), f.width) for f in functions]
         self.weight_count = sum(int(np.prod(shape)) for shape in self.shapes)
@@ -90,8 +96,8 @@ class Density:
         #: Coordinates that are learned: all but components that the configuration fixes.
         self.free = np.concatenate([np.ones(self.weight_count, dtype=bool), *moves])
         #: Gradient of a linear term, by which the uncertainty of the weights enters (see `evidence.occam`), and the
-        #: hyperparameters at which it was found: it is local, so a step away from them costs what a hyperprior of
-        #: log-SD 1 would. Where turns have settled that cost is none.
+        #: hyperparameters at which it was found: it is local, so a step away from them costs something. Where turns
+        #: have settled that cost is none.
         self.tilt = np.zeros(len(self.free))
         self.anchor: Array | None = None
         self.renew()
@@ -131,8 +137,7 @@ class Density:
         loop = self.features.loop
         if loop is None:
             return value
-        known = impedance if self.coupled else diagonal_only(impedance)
-        return value + log_jacobian(loop, known, self.features.valid, self.coupled)
+        return value + log_jacobian(loop, impedance, self.features.valid, self.coupled)
 
     def __call__(self, point: Array) -> tuple[float, Array]:
         """`joint` with its tilt, and its gradient.
@@ -143,9 +148,9 @@ class Density:
         value, gradient = self.joint(point)
         away = np.zeros_like(point)
         if self.anchor is not None:
-            away[self.weight_count :] = (point - self.anchor)[self.weight_count :]
+            away[self.weight_count :] = (point - self.anchor)[self.weight_count :] / TRUSTED
         tilted = value + float(self.tilt @ point) - 0.5 * float(away @ away)
-        return tilted, (gradient + self.tilt - away) * self.free
+        return tilted, (gradient + self.tilt - away / TRUSTED) * self.free
 
     def joint(self, point: Array) -> tuple[float, Array]:
         """Log density of forces, weights and hyperparameters, without constants of the priors, and its gradient.

@@ -18,38 +18,44 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor
 
-from bayes_impedance.impedance_functions.density import Density, log_hyperprior
+from bayes_impedance.impedance_functions import laplace
+from bayes_impedance.impedance_functions.density import OF_IMPEDANCE, Density, log_hyperprior
 from bayes_impedance.impedance_functions.function import ImpedanceFunction
 from bayes_impedance.priors import Entry
 
 Array = NDArray[np.float64]
 
-#: Random directions, in pairs, of the estimate of a trace: with a hundred weights it is good to some per cent.
+#: Random directions of the estimate of a trace: with a hundred weights it is good to some per cent, and exact with as
+#: many as there are weights.
 DIRECTIONS = 16
 SEED = 0
-#: Log-SDs of a hyperprior that one turn may move a hyperparameter: the quadratic is local.
+#: Their length in posterior SDs: over a whole one the curvature of the likelihood changes.
+STEP = 0.1
+#: Log-SDs of a hyperprior that one turn may move a hyperparameter, less near an upper bound: the quadratic is local.
 LARGEST_MOVE = 1.0
 
 
 def occam(density: Density, mode: Array, precision: Array) -> Array:
     """Gradient of −½ log det H by the hyperparameters of `density`, `(size,)`, zero for the weights.
 
-    ∂ log det H = tr H⁻¹ ∂H = E[sᵀ ∂H s] with s ~ N(0, H⁻¹), and sᵀ H s is minus the second difference of the log
-    density along s (Hutchinson's estimate).
+    ∂ log det H = tr H⁻¹ ∂H = Σ_i s_iᵀ ∂H s_i with s_i = H^{−½} q_i for orthonormal q_i, and sᵀ H s is minus the second
+    difference of the log density along s. Of a hundred q_i some random ones stand for all (Hutchinson's estimate).
     """
     count = density.weight_count
     values, vectors = np.linalg.eigh(precision[:count, :count])
-    # The prior's own precision is one; what is below is rounding.
-    root = vectors / np.sqrt(np.maximum(values, 1.0))
+    # Symmetric, for signs and order of eigenvectors are arbitrary, and one turn should look where the last one did.
+    root = (vectors / np.sqrt(np.maximum(values, 1.0))) @ vectors.T
+    chosen = min(DIRECTIONS, count)
     generator = np.random.default_rng(SEED)
+    directions = np.linalg.qr(generator.standard_normal((count, chosen)))[0]
     total = np.zeros_like(mode)
     _, centre = density(mode)
-    for direction in generator.standard_normal((DIRECTIONS, count)):
+    for direction in directions.T:
         step = np.zeros_like(mode)
-        step[:count] = root @ direction
+        step[:count] = STEP * root @ direction
         total += density(mode + step)[1] + density(mode - step)[1] - 2.0 * centre
     total[:count] = 0.0
-    return 0.5 * total / DIRECTIONS
+    return 0.5 * total * count / (chosen * STEP**2)
 
 
 def variation_entries(density: Density) -> list[Entry]:
@@ -57,10 +63,19 @@ def variation_entries(density: Density) -> list[Entry]:
     return [
         entry
         for entry in density.model.entries
-        if entry.name.endswith((".log_sd", ".length_scale"))
-        and entry.name.split(".")[0] in ("stiffness", "damping", "mass")
+        if entry.name.startswith(OF_IMPEDANCE)
+        and entry.name.endswith((".log_sd", ".length_scale"))
         and bool(entry.free.any())
     ]
+
+
+def log_variation_prior(density: Density) -> Tensor:
+    """Log density of `variation_entries`, without constants [nats]."""
+    total = torch.zeros((), dtype=torch.float64)
+    for entry in variation_entries(density):
+        # Of coupled axes each stands for the same one hyperparameter.
+        total = total + log_hyperprior(entry) / (len(entry.raw) if density.coupled else 1)
+    return total
 
 
 def update_variation(density: Density, mode: Array, precision: Array) -> tuple[Array, float]:
@@ -81,20 +96,26 @@ def update_variation(density: Density, mode: Array, precision: Array) -> tuple[A
         _unpack(entries, point)
         for entry in entries:
             entry.raw.grad = None
-        value = quadratic.log_evidence() + torch.stack([log_hyperprior(e) for e in entries]).sum()
+        value = quadratic.log_evidence() + log_variation_prior(density)
         value.backward()
         gradient = np.concatenate([_gradient(entry) for entry in entries])
         if density.coupled:
             gradient = _tied(entries, gradient)
         return -float(value.detach()), -gradient
 
+    before = _scaled_logarithms(entries)
     found = minimize(
         objective, start, jac=True, method="L-BFGS-B",
         bounds=list(zip(start - width, start + width, strict=True)),
     )  # fmt: skip
     _unpack(entries, found.x)
-    moved = float(np.max(np.abs(found.x - start) / scale, initial=0.0))
-    return quadratic.translated(mode), moved
+    return quadratic.translated(mode), float(np.abs(_scaled_logarithms(entries) - before).max())
+
+
+def _scaled_logarithms(entries: list[Entry]) -> Array:
+    """Logarithms of the hyperparameters in log-SDs of their hyperpriors."""
+    parts = [(entry.value.detach().log() / entry.log_sds).reshape(-1) for entry in entries]
+    return torch.cat(parts).numpy()
 
 
 def _pack(entries: list[Entry]) -> Array:
@@ -112,7 +133,8 @@ def _unpack(entries: list[Entry], point: Array) -> None:
 
 def _gradient(entry: Entry) -> Array:
     grad = entry.raw.grad
-    return np.zeros(entry.raw.numel()) if grad is None else grad.reshape(-1).numpy()
+    assert grad is not None
+    return grad.reshape(-1).numpy()
 
 
 def _tied(entries: list[Entry], gradient: Array) -> Array:
@@ -135,7 +157,7 @@ class _Quadratic:
         # The rest is marginalised: a Schur complement.
         inner = precision[:count, :count]
         outer = precision[:count, count:]
-        marginal = inner - outer @ np.linalg.solve(precision[count:, count:], outer.T)
+        marginal = inner - outer @ laplace.covariance(precision[count:, count:]) @ outer.T
         values, vectors = np.linalg.eigh(marginal - np.eye(count))
         likelihood = (vectors * np.maximum(values, 0.0)) @ vectors.T
         weights = mode[:count]

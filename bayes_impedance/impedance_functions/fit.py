@@ -6,18 +6,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from bayes_impedance.errors import NotPositiveDefiniteError
 from bayes_impedance.impedance_functions import laplace
 from bayes_impedance.impedance_functions.density import Density
-from bayes_impedance.impedance_functions.evidence import occam, update_variation
+from bayes_impedance.impedance_functions.evidence import log_variation_prior, occam, update_variation
 
 Array = NDArray[np.float64]
 
 #: Turns of mode and evidence, and the change of a hyperparameter's logarithm below which they end.
-TURNS, SETTLED = 4, 0.05
+TURNS, SETTLED = 10, 0.05
 #: Iterations before the curvature is looked at, in whose coordinates a climb is several times as short.
 FIRST = 150
 #: What a step costs that leads where the likelihood overflows [nats].
@@ -31,12 +32,13 @@ RELATIVE_TOLERANCE = 1e-9
 class Mode:
     """A maximum of a `Density`: `point` `(size,)` and the covariance `(free, free)` of its free coordinates about it.
 
-    `log_evidence` of the forces, the functions integrated out by Laplace's method, with the hyperparameters'
-    log density in it [nats].
+    `log_evidence` of the forces at the hyperparameters, the functions integrated out by Laplace's method, and
+    `log_posterior`, which has the hyperpriors' log density in it, without constants [nats].
     """
 
     point: Array
     log_evidence: float
+    log_posterior: float
     covariance: Array
     iterations: int
     evaluations: int
@@ -68,6 +70,8 @@ def find_mode(
         precision = _precision(density, point)
         if max(moved, np.max(np.abs(point[density.weight_count :] - before), initial=0.0)) < SETTLED:
             break
+    else:
+        climb.outcome = f"STOP: {TURNS} TURNS OF MODE AND EVIDENCE HAVE NOT SETTLED"
     return _mode(density, point, precision, climb)
 
 
@@ -94,14 +98,23 @@ def find_weights(
 def _mode(density: Density, point: Array, precision: Array, climb: _Climb) -> Mode:
     joint, _ = density.joint(point)
     count = density.weight_count
-    evidence = joint - 0.5 * laplace.log_determinant(precision[:count, :count])
+    marginal = joint - 0.5 * laplace.log_determinant(precision[:count, :count])
+    with torch.no_grad():
+        beside, variation = float(density.log_hyperpriors()), float(log_variation_prior(density))
     return Mode(
-        point, evidence, laplace.covariance(precision), climb.iterations, climb.evaluations, climb.outcome
+        point=point,
+        log_evidence=marginal - beside,
+        log_posterior=marginal + variation,
+        covariance=laplace.covariance(precision),
+        iterations=climb.iterations,
+        evaluations=climb.evaluations,
+        outcome=climb.outcome,
     )
 
 
 def _precision(density: Density, point: Array) -> Array:
-    return laplace.precision(lambda at: density(at)[1], point, density.free)
+    # Not of the tilted density: the cost of steps away from the anchor is no knowledge.
+    return laplace.precision(lambda at: density.joint(at)[1], point, density.free)
 
 
 class _Climb:

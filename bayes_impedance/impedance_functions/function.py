@@ -8,6 +8,7 @@ hyperprior, s and R log-SD and correlation of its variation along the input ξ, 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -135,21 +136,22 @@ def _function(
     places: Sequence[tuple[int, int]],
     inducing: Tensor | None,
 ) -> ImpedanceFunction:
-    on_diagonal = torch.tensor([a == b for a, b in places])
     level_sd = _level_sd(prior.level)
     coupling = prior.coupling.median
     if inducing is None:
         constant = _constant_log_sd(prior)
         level_sd = (level_sd**2 + constant**2) ** 0.5
         coupling = (coupling**2 + OFF_DIAGONAL * constant**2) ** 0.5
-    median = torch.tensor(prior.level.median, dtype=torch.float64).log()
-    zero = torch.zeros((), dtype=torch.float64)
+
+    def by_place(on: float, off: float) -> Tensor:
+        return torch.tensor([on if a == b else off for a, b in places], dtype=torch.float64)
+
     return ImpedanceFunction(
         process=process,
         places=tuple(places),
-        location=torch.where(on_diagonal, median, zero),
-        level_sd=torch.where(on_diagonal, level_sd, coupling).to(torch.float64),
-        scale=torch.where(on_diagonal, 1.0, OFF_DIAGONAL**0.5).to(torch.float64),
+        location=by_place(math.log(prior.level.median), 0.0),
+        level_sd=by_place(level_sd, coupling),
+        scale=by_place(1.0, OFF_DIAGONAL**0.5),
         inducing=inducing,
     )
 

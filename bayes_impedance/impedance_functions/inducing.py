@@ -9,7 +9,7 @@ from bayes_impedance.features import Features
 from bayes_impedance.kernels.stationary import StationaryKernel
 from bayes_impedance.kernels.warped import evaluate
 
-#: Candidates among which inducing inputs of several dimensions are chosen.
+#: At most so many candidates among which inducing inputs of several dimensions are chosen.
 CANDIDATES = 2000
 
 
@@ -29,7 +29,7 @@ def inducing_inputs(covariance: StationaryKernel, features: Features, count: int
             float(values.min()), float(values.max()), count, dtype=rows.dtype
         )
         return result
-    step = max(1, len(rows) // CANDIDATES)
+    step = -(-len(rows) // CANDIDATES)
     return _least_known(covariance, rows[::step], count)
 
 

@@ -35,5 +35,8 @@ def covariance(hessian: Array) -> Array:
 
 
 def log_determinant(hessian: Array) -> float:
-    """log det of the precision of whitened variables: no eigenvalue is below that of the prior, 1, but by rounding."""
+    """log det of the precision of whitened variables.
+
+    Eigenvalues below that of the prior, 1, count as 1: rounding, or a likelihood that is not concave there.
+    """
     return float(np.log(np.maximum(np.linalg.eigvalsh(hessian), 1.0)).sum())

@@ -37,6 +37,7 @@ def condition(
     Raises:
         NotPositiveDefiniteError: the likelihood is not finite.
         ConfigurationError: the engine cannot hold the processes at these samples.
+        TooManySamplesError: the engine is dense, and the samples are too many.
     """
     density = build_density(config, model, given, fitted.inducing, fitted.engine.name)
     if trained_on:
@@ -55,10 +56,10 @@ def function_evidence(config: Config, model: ForceModel, fitted: FittedFunctions
     Raises:
         NotPositiveDefiniteError: the likelihood is not finite.
         ConfigurationError: the engine cannot hold the processes at these samples.
+        TooManySamplesError: the engine is dense, and the samples are too many.
     """
     density = build_density(config, model, given, fitted.inducing, fitted.engine.name)
-    mode = _mode_of_weights(config, density, fitted)
-    return mode.log_evidence - float(density.log_hyperpriors().detach())
+    return _mode_of_weights(config, density, fitted).log_evidence
 
 
 def _mode_of_weights(config: Config, density: Density, fitted: FittedFunctions) -> Mode:
@@ -84,9 +85,9 @@ def compute_function_posterior(
 ) -> Posterior:
     """Posteriors at `target`, the features of `log`; the prior for groups that `conditioned` knows no forces of."""
     wanted = list(Latent) if latents is None else list(latents)
-    known = (
-        [] if conditioned is None else [g for g in target.groups if g in conditioned.density.features.groups]
-    )
+    # In the order of the forces given, which that of `target` need not be.
+    given = () if conditioned is None else conditioned.density.features.groups
+    known = [g for g in given if g in target.groups]
     unknown = [g for g in target.groups if g not in known]
     others = [latent for latent in wanted if latent not in IMPEDANCE_ORDER]
     parts: list[tuple[list[str], dict[Latent, Moments]]] = []

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -15,7 +17,7 @@ from bayes_impedance.engines.choice import EngineChoice, build_engine, choose_en
 from bayes_impedance.engines.given_impedance import Processes
 from bayes_impedance.errors import NotPositiveDefiniteError
 from bayes_impedance.features import Features
-from bayes_impedance.impedance_functions.density import Density
+from bayes_impedance.impedance_functions.density import Density, beside_impedance
 from bayes_impedance.impedance_functions.fit import Mode, find_mode
 from bayes_impedance.impedance_functions.function import build_functions, choose_inducing
 from bayes_impedance.priors import ForceModel
@@ -50,12 +52,23 @@ def build_density(
 
     Raises:
         ConfigurationError: the engine cannot hold the processes.
+        TooManySamplesError: the engine is dense, and the samples are too many.
     """
     coupled = config.model.axes == "coupled"
     periodic = config.model.desired_trajectory.periodic
     processes = Processes.of(model, periodic)
     built = build_engine(engine, config.engine, processes, features, coupled)
     return Density(model, build_functions(config, model, inducing), built, features, coupled, periodic)
+
+
+def expected_sizes(config: Config, model: ForceModel, fitted: FittedFunctions) -> tuple[int, int]:
+    """Coordinates of the point that `fitted` should have, and those of them that are free."""
+    functions = build_functions(config, model, fitted.inducing)
+    weights = len(fitted.groups) * sum(len(function.places) * function.width for function in functions)
+    entries = beside_impedance(model)
+    size = weights + sum(entry.raw.numel() for entry in entries)
+    free = weights + sum(len(entry.raw) * int(entry.free.sum()) for entry in entries)
+    return size, free
 
 
 def train_functions(
@@ -74,12 +87,12 @@ def train_functions(
     processes = Processes.of(model, config.model.desired_trajectory.periodic)
     choice = choose_engine(config.engine, processes, features, config.model.axes == "coupled")
     inducing = choose_inducing(config, model, features)
-    start_of_variation = {entry.name: entry.raw.detach().clone() for entry in model.entries}
+    initial = {entry.name: entry.raw.detach().clone() for entry in model.entries}
     search = _Search(config, progress)
     for restart in range(config.training.restarts):
         with torch.no_grad():
             for entry in model.entries:
-                entry.raw.copy_(start_of_variation[entry.name])
+                entry.raw.copy_(initial[entry.name])
         density = build_density(config, model, features, inducing, choice.name)
         if search.run(restart, density) == "interrupted":
             break
@@ -98,7 +111,6 @@ class _Found:
 
     restart: int
     mode: Mode
-    likelihood: float
     raws: dict[str, Tensor]
     log_sd: dict[str, list[list[float]]]
 
@@ -127,27 +139,26 @@ class _Search:
             if not self.found:
                 raise
             return self._failed(restart, "interrupted", clock)
-        _level_at_average(density, mode.point)
-        likelihood = mode.log_evidence - float(density.log_hyperpriors().detach())
+        log_sd = _set_levels(density, mode) | _log_sds(density, mode)
         raws = {entry.name: entry.raw.detach().clone() for entry in density.model.entries}
-        self.found.append(_Found(restart, mode, likelihood, raws, _log_sds(density, mode)))
+        self.found.append(_Found(restart, mode, raws, log_sd))
         self._append(
-            restart, mode.log_evidence, likelihood, mode.iterations, mode.evaluations, mode.outcome, clock
-        )
+            restart, mode.log_posterior, mode.log_evidence, mode.iterations, mode.evaluations, mode.outcome, clock
+        )  # fmt: skip
         return mode.outcome
 
     def best(self) -> _Found:
         if not self.found:
             assert self.failure is not None
             raise self.failure
-        return max(self.found, key=lambda one: one.mode.log_evidence)
+        return max(self.found, key=lambda one: one.mode.log_posterior)
 
     def report(self, best: _Found, samples: int) -> TrainingReport:
         return TrainingReport(
             restarts=tuple(self.reports),
             best=(best.restart,),
-            log_likelihood=(best.likelihood,),
-            objective=(best.mode.log_evidence,),
+            log_likelihood=(best.mode.log_evidence,),
+            objective=(best.mode.log_posterior,),
             log_sd=best.log_sd,
             interrupted=any(report.outcome == "interrupted" for report in self.reports),
             samples=samples,
@@ -162,9 +173,8 @@ class _Search:
             point = point + spread * density.free * self.generator.standard_normal(point.shape)
         return point
 
-    def _hook(self, restart: int):  # type: ignore[no-untyped-def] # a closure of one line
-        progress = self.progress
-        return None if progress is None else lambda iteration, value: progress(restart, iteration, value)
+    def _hook(self, restart: int) -> Callable[[int, float], None] | None:
+        return None if self.progress is None else partial(self.progress, restart)
 
     def _failed(self, restart: int, outcome: str, clock: float) -> str:
         self._append(restart, -np.inf, -np.inf, 0, 0, outcome, clock)
@@ -180,17 +190,39 @@ class _Search:
         )
 
 
-def _level_at_average(density: Density, point: Array) -> None:
-    """Put the levels of the model's own priors where the functions are on average, for whoever reads them there."""
-    weights = density.weights(torch.from_numpy(point))
-    parts = zip(density.functions, density.designs.designs, weights, strict=True)
-    for entry_name, (function, design, own) in zip(("stiffness", "damping", "mass"), parts, strict=True):
-        entry = next(e for e in density.model.entries if e.name == f"{entry_name}.level")
-        if entry.specs[0].fixed:
-            continue
-        with torch.no_grad():
-            diagonal = function.logarithm(design, own)[..., : function.axes].mean((0, 1)).exp()
-            function.process.level = diagonal.reshape(function.process.raw_level.shape)
+def _set_levels(density: Density, mode: Mode) -> dict[str, list[list[float]]]:
+    """Put the levels of the model's own priors where the functions are on average, for whoever reads them there.
+
+    Averages of the diagonal of the logarithm, over the samples of all groups. Returns their Laplace SDs by name.
+    """
+    log_sd = {}
+    parts = zip(("stiffness", "damping", "mass"), density.functions, density.designs.designs, strict=True)
+    entries = {entry.name: entry for entry in density.model.entries}
+    share = _shares(density.features)
+    start = 0
+    for name, function, design in parts:
+        groups, places, width = design.shape[0], design.shape[1], design.shape[3]
+        count = groups * places * width
+        if not entries[f"{name}.level"].specs[0].fixed:
+            average = torch.einsum("genw,gn->gew", design, share).numpy()
+            where = np.arange(start, start + count).reshape(groups, places, width)
+            levels, spreads = [], []
+            for e in range(function.axes):
+                own, factor = where[:, e].reshape(-1), average[:, e].reshape(-1)
+                levels.append(float(function.location[e]) + factor @ mode.point[own])
+                spreads.append([float(np.sqrt(factor @ mode.covariance[np.ix_(own, own)] @ factor))])
+            shape = function.process.raw_level.shape
+            function.process.level = torch.tensor(levels, dtype=torch.float64).exp().reshape(shape)
+            log_sd[f"{name}.level"] = spreads
+        start += count
+    return log_sd
+
+
+def _shares(features: Features) -> Tensor:
+    """What each sample has in an average over all, `(groups, n)`; zero on padding."""
+    ones = features.inputs.new_ones(features.inputs.shape[1:3])
+    counted = ones if features.valid is None else ones * features.valid
+    return counted / counted.sum()
 
 
 def _log_sds(density: Density, mode: Mode) -> dict[str, list[list[float]]]:

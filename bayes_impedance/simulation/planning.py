@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from bayes_impedance.config import replace_value
 from bayes_impedance.engines.dense import check_capacity
-from bayes_impedance.errors import SimulationError
+from bayes_impedance.errors import ConfigurationError, SimulationError
 from bayes_impedance.identifiability import Support
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
 from bayes_impedance.model import ImpedanceModel
@@ -217,9 +217,15 @@ def plan(
     Raises:
         SimulationError: nothing to plan for, a number is out of range, or the template has several subjects or no
             perturbation.
-        LogError, ConfigurationError, TooManySamplesError, NotPositiveDefiniteError: as of a recording.
+        ConfigurationError: impedance is a function, or as of a recording.
+        LogError, TooManySamplesError, NotPositiveDefiniteError: as of a recording.
     """
     _check(experiment, repetitions, perturbations, motions, pilot)
+    if model.config.engine.impedance == "map":
+        raise ConfigurationError(
+            "expected engine.impedance: moments to plan with, whose widths hardly depend on force, got map; set "
+            "engine.impedance=moments (and what it cannot have otherwise), or plan with the configuration admittance"
+        )
     counts, sizes = sorted(set(repetitions)), sorted(set(perturbations))
     unit = SIZES[type(experiment.perturbation)][1]
     sessions = [(size, seed + motion) for size in sizes for motion in range(motions)]
