@@ -21,7 +21,7 @@ from bayes_impedance.commands.inspect import inspect_command
 from bayes_impedance.commands.plan import plan_command
 from bayes_impedance.commands.simulate import simulate_command
 from bayes_impedance.config import load_config, shipped_configurations
-from bayes_impedance.demo import record, truth_errors
+from bayes_impedance.demo import coupling_errors, record, truth_errors
 from bayes_impedance.errors import (
     BayesImpedanceError,
     BayesImpedanceWarning,
@@ -40,6 +40,7 @@ from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.outputs import check_replaceable, check_writable, prepare_folder, write_json
 from bayes_impedance.persistence import METADATA, load_model, save_model
 from bayes_impedance.plotting import plot_force, save_figure, save_figures
+from bayes_impedance.posterior import UNITS
 from bayes_impedance.readers import read_log
 from bayes_impedance.sensitivity import Sensitivity, prior_sensitivity
 from bayes_impedance.writer import check_table_name, write_table
@@ -146,8 +147,9 @@ def demo(
 ) -> None:
     """Do the main job on a simulated experiment whose truth is known: train, infer, evaluate, draw.
 
-    A simulated arm traces a figure of eight five times on a device that perturbs it; four repetitions train, the fifth
-    tests.
+    A simulated arm, in a posture that couples its axes, traces a figure of eight five times on a device that perturbs
+    it; four repetitions train, the fifth tests. The configuration is `arm`: stiffness, damping and mass are matrices
+    that vary along the path.
     """
     console = Console()
     check_replaceable(out / "model", METADATA)
@@ -159,14 +161,19 @@ def demo(
     model = ImpedanceModel(recording.config)
     with terminal.training_progress(console, recording.config.training, "training") as progress:
         model = model.fit(read_log(recording.training, recording.config.log), progress)
+    console.print(str(model.engine), highlight=False, soft_wrap=True)
     save_model(model, out / "model")
     if model.report.interrupted:
         raise KeyboardInterrupt
     posterior = model.posterior(model.fitted.log)
     verdicts = terminal.print_verdicts(console, model, posterior)
-    errors = truth_errors(lambda name: posterior[name].mean, model.fitted.log)
-    listed = ", ".join(f"{name} {error:.1%}" for name, error in errors.items())
+    listed = ", ".join(f"{name} {error:.1%}" for name, error in truth_errors(posterior).items())
     console.print(f"Mean relative error against the truth: {listed}", highlight=False)
+    listed = ", ".join(
+        f"{name} {error:.2g} {UNITS[Latent(name.split('_')[0])]}"
+        for name, error in coupling_errors(posterior).items()
+    )
+    console.print(f"Mean absolute error of what couples the axes: {listed}", highlight=False)
     unseen = model.prepare(read_log(recording.testing, recording.config.log))
     watch = partial(terminal.training_progress, console)
     scores = evaluate(model, unseen, ["naive"], progress=watch)

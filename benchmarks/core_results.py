@@ -17,7 +17,7 @@ import numpy as np
 
 from bayes_impedance import ImpedanceModel, InteractionLog, Latent, evaluate, load_config, read_log
 from bayes_impedance.config import Config, parse_config
-from bayes_impedance.demo import record, truth_errors
+from bayes_impedance.demo import coupling_errors, record, truth_errors
 from bayes_impedance.evaluation.held_out import as_json
 from bayes_impedance.features import FeatureMap, Features
 from bayes_impedance.posterior import compute_posterior
@@ -66,8 +66,13 @@ def demo() -> Results:
         test = read_log(recording.testing, recording.config.log)
         scores = as_json(evaluate(model, test, ["naive"]))
     posterior = model.posterior(model.fitted.log)
-    errors = truth_errors(lambda name: posterior[name].mean, model.fitted.log)
-    return {"seed": 0, "mean_relative_error": errors, "scores": scores}
+    return {
+        "seed": 0,
+        "engine": model.engine.name,
+        "mean_relative_error": truth_errors(posterior),
+        "mean_absolute_error": coupling_errors(posterior),
+        "scores": scores,
+    }
 
 
 def coverage() -> Results:

@@ -20,7 +20,6 @@ from bayes_impedance.baselines.kalman import ExtendedKalmanFilter
 from bayes_impedance.baselines.naive import NaiveModel
 from bayes_impedance.baselines.recursive import RecursiveLeastSquares
 from bayes_impedance.config import Config
-from bayes_impedance.demo import CENTRE as UNCOUPLED
 from bayes_impedance.evaluation.contenders import Baseline, Predictor
 from bayes_impedance.evaluation.held_out import as_json, predict, scored
 from bayes_impedance.evaluation.metrics import Scores
@@ -33,7 +32,7 @@ from bayes_impedance.simulation.arm import TABLE_I, arm_with
 from bayes_impedance.simulation.device import Admittance, BandLimitedForce, Perturbation, Unperturbed
 from bayes_impedance.simulation.experiment import Experiment, simulate
 from bayes_impedance.simulation.subjects import SUBJECTS, Subject, find_subject
-from bayes_impedance.simulation.tasks import CENTRE, FigureEight, Flower, Pace, Path
+from bayes_impedance.simulation.tasks import CENTRE, UNCOUPLED, FigureEight, Flower, Pace, Path
 from benchmarks.results import Results, commit
 
 SETTINGS = ("low", "high")

@@ -169,7 +169,7 @@ def test_infer_draws_figures(command, tiny, tmp_path):
     figures = tmp_path / "new" / "figures"
     done = command("infer", tiny.model, tiny.other, "--out", tmp_path / "p.csv", "--figures", figures)
     assert (done.code, done.err) == (0, "")
-    names = ["desired_trajectory.png", "force.png", "impedance.png"]
+    names = ["desired_trajectory.png", "ellipses.png", "force.png", "impedance.png"]
     assert sorted(path.name for path in figures.iterdir()) == names
     for name in names:
         assert f"wrote {figures / name}\n" in done.out
@@ -318,6 +318,7 @@ def test_demo_does_the_main_job_and_meets_the_truth(command, tmp_path, monkeypat
     assert (done.code, done.err) == (0, "")
     assert sorted(path.name for path in out.iterdir()) == [
         "desired_trajectory.png",
+        "ellipses.png",
         "force.png",
         "impedance.png",
         "model",
@@ -332,6 +333,17 @@ def test_demo_does_the_main_job_and_meets_the_truth(command, tmp_path, monkeypat
     assert set(errors) == {f"{name}_{axis}{axis}" for name in MATRICES for axis in "xy"}
     # Ten iterations already come this close.
     assert max(float(error.rstrip("%")) for error in errors.values()) < 25
+    coupled = re.search(r"Mean absolute error of what couples the axes: (.*)", done.out)
+    assert coupled is not None
+    errors = {item.split(" ")[0]: item.split(" ", 1)[1].split(" ") for item in coupled[1].split(", ")}
+    assert {name: unit for name, (_, unit) in errors.items()} == {
+        "stiffness_xy": "N/m",
+        "damping_xy": "Ns/m",
+        "mass_xy": "kg",
+    }
+    # Of −.8 kg.
+    assert float(errors["mass_xy"][0]) < 0.2
+    assert "engine markov: exact" in done.out
     # Four repetitions train, the fifth tests.
     assert len(load_model(out / "model").fitted.log.trials) == 4
     assert set(pd.read_csv(out / "testing.csv")["trial"]) == {"0-4"}

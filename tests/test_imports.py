@@ -160,6 +160,16 @@ IMPEDANCE_FUNCTIONS = (
 )
 #: Training and posteriors of functions give what training and posteriors of moments give.
 FITTED_FUNCTIONS = ("impedance_functions.train", "impedance_functions.posterior")
+PLOTTING = (
+    "plotting.panels",
+    "plotting.over_time",
+    "plotting.impedance",
+    "plotting.ellipses",
+    "plotting.plans",
+    "plotting.recordings",
+    "plotting.files",
+    "plotting",
+)
 COMMANDS = (
     "commands.inspection_tables",
     "commands.inspect",
@@ -201,7 +211,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             {"evaluation", "evaluation.cross_validation"},
             {"__init__"},
             SIMULATION,
-            {"plotting", "terminal"},
+            {*PLOTTING, "terminal"},
             {"demo", *COMMANDS},
             {"cli"},
             {"__main__"},
@@ -222,11 +232,12 @@ FAMILIES = (
     FITTED_FUNCTIONS,
     BASELINES,
     SIMULATION,
+    PLOTTING,
     COMMANDS,
 )
 
 #: Only the command line and its demo show, draw or simulate anything.
-PRESENTATION = {"cli", *COMMANDS, "demo", "terminal", "plotting", *SIMULATION}
+PRESENTATION = {"cli", *COMMANDS, "demo", "terminal", *PLOTTING, *SIMULATION}
 
 #: What a kernel may know of this package: other kernels. They are to be taken into other people's code.
 FREE = ("kernels.", "evaluation.metrics", "errors")
@@ -241,7 +252,7 @@ CONFINED = {
         "engines.markov.recursions",
         "engines.markov.reverse",
     },
-    "matplotlib": {"plotting"},
+    "matplotlib": set(PLOTTING) - {"plotting", "plotting.files"},
     "pydantic": set(CONFIG) - {"config"},
     "yaml": {"config.loading"},
     "safetensors": {"persistence"},

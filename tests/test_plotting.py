@@ -222,7 +222,12 @@ def test_plan(width, latent):
 
 def test_saved_figures(posterior, verdicts, tmp_path):
     paths = save_figures(posterior, verdicts, tmp_path, trials=[1])
-    assert [path.name for path in paths] == ["force.png", "desired_trajectory.png", "impedance.png"]
+    assert [path.name for path in paths] == [
+        "force.png",
+        "desired_trajectory.png",
+        "impedance.png",
+        "ellipses.png",
+    ]
     assert sorted(tmp_path.iterdir()) == sorted(paths)
     for path in paths:
         assert path.read_bytes().startswith(PNG)

@@ -50,6 +50,8 @@ def test_demo() -> None:
     figures, now = CORE["demo"], demo()
     for name, error in figures["mean_relative_error"].items():
         assert now["mean_relative_error"][name] == pytest.approx(error, abs=0.01)
+    for name, error in figures["mean_absolute_error"].items():
+        assert now["mean_absolute_error"][name] == pytest.approx(error, rel=0.1)
 
 
 def test_closed_loop() -> None:

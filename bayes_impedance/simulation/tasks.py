@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 #: Middle of the workspace, from the shoulder [m].
 CENTRE = (0.30, 0.325)
+#: Where stiffness and mass of the arm hardly couple the axes [m].
+UNCOUPLED = (0.275, 0.2)
 
 
 class Path(Protocol):
