@@ -24,7 +24,8 @@ class Segmentation(Section):
     makes a trial of what lies between two rests; `split: return` makes a repetition of what lies between two passages
     of the start, within `return_radius` [m] of it, having left it by twice that. Parts shorter than `minimum_duration`
     [s] are left out; a way out of the radius that is shorter is no round. `gaps: split` begins a new trial behind a gap
-    longer than `max_gap`, in place of refusing it.
+    longer than `max_gap`, in place of refusing it. `repetitions_as_trials`: each repetition, found or labelled, becomes
+    a trial once it is smoothed, with a residual force of its own.
     """
 
     trim_rest: bool = False
@@ -34,6 +35,7 @@ class Segmentation(Section):
     return_radius: float = Field(default=0.02, gt=0)
     minimum_duration: float = Field(default=0.5, gt=0)
     gaps: Literal["refuse", "split"] = "refuse"
+    repetitions_as_trials: bool = False
 
 
 class PhaseConfig(Section):

@@ -12,6 +12,8 @@ from bayes_impedance.engines.given_impedance import ConditionalEngine, Processes
 from bayes_impedance.errors import ConfigurationError
 from bayes_impedance.features import Features
 
+#: Forces up to which dense is taken unasked: finding functions takes hundreds of evaluations, of a second each there.
+FEW = 1500
 MOMENTS = "stiffness, damping and mass are integrated out, which only dense covariances do"
 
 
@@ -55,17 +57,18 @@ def choose_engine(
     if not_markov is None:
         return EngineChoice("markov", "exact, at a cost that grows with the number of samples")
     size = _largest(features, coupled)
-    if size <= config.max_samples and not processes.periodic:
+    if size <= min(config.max_samples, FEW) and not processes.periodic:
         return EngineChoice(
             "dense", f"exact for any process, and {size} forces are few; not markov: {not_markov}"
         )
     not_lowrank = _refusal("lowrank", processes, features, coupled)
     if not_lowrank is None:
         return EngineChoice("lowrank", f"features stand for the processes; not markov: {not_markov}")
+    most = f"engine.max_samples = {config.max_samples}" if config.max_samples <= FEW else str(FEW)
     raise ConfigurationError(
         f"engine.name: expected processes that one of the engines holds, found {size} forces in a group, with dense "
-        f"for at most engine.max_samples = {config.max_samples} and no periodic phase; not markov: {not_markov}; "
-        f"not lowrank: {not_lowrank}"
+        f"for at most {most} and no periodic phase; not markov: {not_markov}; not lowrank: {not_lowrank}; mend one of "
+        "these, thin the log with preprocessing.rate, or set engine.name=dense and wait"
     )
 
 

@@ -51,6 +51,9 @@ def prepare(
     """
     log = segment(log, config)
     prepared = PreparedLog(log.axes, tuple(_prepare(trial, config) for trial in log.trials))
+    if config.segmentation.repetitions_as_trials:
+        parts = tuple(part for trial in prepared.trials for part in _by_repetition(trial))
+        prepared = PreparedLog(log.axes, parts)
     return align(prepared, config.phase, reference) if config.phase.source == "warping" else prepared
 
 
@@ -192,6 +195,25 @@ def _as_logged(trial: Trial) -> PreparedTrial:
 def _gradients(values: Array, time: Array) -> Orders:
     first = np.gradient(values, time, axis=0)
     return values, first, np.gradient(first, time, axis=0)
+
+
+# --- repetitions ---------------------------------------------------------------------------------
+
+
+def _by_repetition(trial: PreparedTrial) -> list[PreparedTrial]:
+    """Each repetition as a trial, cut from what was smoothed in one piece."""
+    parts = list(repetitions(trial))
+    if len(parts) == 1:
+        return [trial]
+    return [
+        replace(
+            trial,
+            name=f"{trial.name}.{number}",
+            **{key: value[part] for key in ARRAYS if (value := getattr(trial, key)) is not None},
+            truth={key: value[part] for key, value in trial.truth.items()},
+        )
+        for number, part in enumerate(parts, start=1)
+    ]
 
 
 # --- rate ----------------------------------------------------------------------------------------

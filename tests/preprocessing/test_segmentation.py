@@ -330,3 +330,20 @@ def test_any_motion_is_segmented_or_refused(seed, n, split, speed, duration):
         np.testing.assert_array_equal(np.unique(trial.repetition), np.arange(trial.repetition[-1] + 1))
     together = np.concatenate([trial.time for trial in result.trials])
     assert (np.diff(together) > 0).all() and np.isin(together, time).all()
+
+
+def test_repetitions_become_trials_once_smoothed():
+    time = np.arange(400) / 100.0
+    position = 0.1 * np.sin(np.pi * time)
+    repetition = np.repeat([0, 1], 200)
+    phase = np.tile(np.linspace(0.0, 0.99, 200), 2)
+    log = InteractionLog.from_arrays(
+        time, position, np.cos(time), axes=["x"], repetition=repetition, phase=phase
+    )
+    whole = prepare(log, PreprocessingConfig(rate=20)).trials[0]
+    parts = prepare(log, PreprocessingConfig(rate=20, segmentation={"repetitions_as_trials": True})).trials
+    assert [part.name for part in parts] == [f"{whole.name}.1", f"{whole.name}.2"]
+    assert [len(np.unique(part.repetition)) for part in parts] == [1, 1]
+    for name in ("time", "position", "velocity", "acceleration", "force", "phase", "phase_velocity"):
+        joined = np.concatenate([getattr(part, name) for part in parts])
+        np.testing.assert_array_equal(joined, getattr(whole, name))
