@@ -17,7 +17,7 @@ from bayes_impedance.config import load_config
 from bayes_impedance.errors import ConfigurationError, ModelFolderError, OutputError
 from bayes_impedance.evaluation.cross_validation import cross_validate
 from bayes_impedance.evaluation.held_out import evaluate
-from bayes_impedance.impedance_functions import conditioned
+from bayes_impedance.impedance_functions import conditioned, fit
 from bayes_impedance.journal import open_journal
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
 from bayes_impedance.model import ImpedanceModel
@@ -45,9 +45,10 @@ POSITION = (
 
 
 @pytest.fixture(autouse=True)
-def few_draws(monkeypatch):
-    """Variances of other latents are not what is looked at here."""
+def in_a_hurry(monkeypatch):
+    """How good modes and variances are is looked at elsewhere."""
     monkeypatch.setattr(conditioned, "PAIRS", 2)
+    monkeypatch.setattr(fit, "TURNS", 1)
 
 
 @pytest.fixture(scope="module")
