@@ -2,13 +2,15 @@
 
 import json
 from pathlib import Path
-from statistics import geometric_mean
+from statistics import fmean, geometric_mean
 from typing import Any
 
 import pytest
 
 from benchmarks.closed_loop_results import SEEDS, WAYS, estimate
 from benchmarks.core_results import configuration_of, coverage_of, demo, known_equilibrium
+from benchmarks.coupled_results import SEEDS as COUPLED_SEEDS
+from benchmarks.coupled_results import identified
 from benchmarks.planning_results import ARMS, CHECKED_PERTURBATIONS, PERTURBATIONS, planned, widths
 from benchmarks.reading_results import BAGS, RECORDINGS, bag
 from benchmarks.recordings_results import last_third
@@ -136,6 +138,46 @@ def test_planning() -> None:
             assert [each["coupling"] for each in force] == sorted(each["coupling"] for each in force)
             at_most = figures[arm]["5 N"]["planned"][f"stiffness_{axis}"]["12"]
             assert at_most > 0.8 * figures[arm]["1 N"]["planned"][f"stiffness_{axis}"]["12"]
+
+
+def test_coupled() -> None:
+    """One session again, and what is said of matrices along the path: how near, and what the bands hold."""
+    figures = committed("coupled")["figures"]
+    now = identified(0)
+    matrices = figures["identification"]["coupled"]
+    for name, entry in now["entries"].items():
+        assert entry["truth"] == pytest.approx(matrices[name]["truth"][0], rel=1e-5)
+        # Of rounding in another order, through a search that ends within its tolerance.
+        scale = abs(entry["truth"])
+        assert entry["estimate"] == pytest.approx(matrices[name]["estimate"][0], abs=2e-3 * scale)
+        assert entry["coverage"] == pytest.approx(figures["coverage"][name][0], abs=0.03)
+    for name, found in matrices.items():
+        assert len(found["truth"]) == len(COUPLED_SEEDS)
+        for truth, found_mean in zip(found["truth"], found["estimate"], strict=True):
+            if name == "mass_xy":
+                assert abs(found_mean - truth) < 0.15
+            elif not name.endswith("xy"):
+                assert abs(found_mean / truth - 1.0) < (0.15 if name.startswith("mass") else 0.10)
+        assert 0.75 < fmean(figures["coverage"][name]) < 0.97
+        assert max(figures["relative_width"][name]) < 0.5
+    stiffness = [figures["coverage"][f"stiffness_{entry}"] for entry in ("xx", "yy", "xy")]
+    assert 0.80 < fmean(fmean(seeds) for seeds in stiffness) < 0.97
+    for axis in figures["trajectory"]["coupled"].values():
+        assert fmean(axis["rms_error"]) < 0.25 * fmean(axis["hand"])
+
+
+def test_ignoring_coupling_costs() -> None:
+    """Diagonal matrices: mass low by a seventh with bands that miss it, and unseen force far less well predicted."""
+    figures = committed("coupled")["figures"]
+    for axis in "xy":
+        entry = figures["identification"]["independent"][f"mass_{axis}{axis}"]
+        errors = [e / t - 1.0 for t, e in zip(entry["truth"], entry["estimate"], strict=True)]
+        assert fmean(errors) < -0.12
+        assert fmean(figures["along_path"]["independent"][f"mass_{axis}{axis}"]["coverage"]) < 0.5
+        for seed in figures["force"].values():
+            rivals = [scores for name, scores in seed[axis].items() if name != "arm"]
+            assert all(seed[axis]["arm"]["msll"] < scores["msll"] - 1.0 for scores in rivals)
+            assert all(seed[axis]["arm"]["smse"] < 0.3 * scores["smse"] for scores in rivals)
 
 
 def test_recordings(shared_data: Path) -> None:
