@@ -9,7 +9,7 @@ from bayes_impedance.errors import LogError
 from bayes_impedance.identifiability import Support, Verdict
 from bayes_impedance.impedance_functions.log_matrix import LogMatrix
 from bayes_impedance.impedance_functions.symmetric import entries
-from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER
+from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
 from bayes_impedance.plotting import plot_ellipses, plot_impedance, save_figures
 from bayes_impedance.plotting.ellipses import ANGLES, ellipse_radii, evenly_spaced
 from bayes_impedance.posterior import Marginal, Posterior, draw_matrices
@@ -198,7 +198,7 @@ def test_impedance_shows_what_couples_the_axes(planar):
 def test_one_axis_has_no_file_of_ellipses(log, tmp_path):
     posterior = coupled(log, "x")
     alone = replace(posterior, couplings={})
-    for latent in ("force", "desired_position"):
+    for latent in (Latent.FORCE, Latent.DESIRED_POSITION):
         values = np.zeros((len(alone.log.trials[0].time), 1))
         alone.marginals[latent] = Marginal(latent, False, values, values + 1.0, values, values + 1.0)
     paths = save_figures(alone, verdicts("x"), tmp_path)

@@ -12,13 +12,13 @@ from bayes_impedance.kernels import Latent
 from bayes_impedance.log import InteractionLog
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.plotting import (
-    MARKERS,
     plot_desired_trajectory,
     plot_force,
     plot_impedance,
     plot_plan,
     save_figures,
 )
+from bayes_impedance.plotting.plans import MARKERS
 from bayes_impedance.readers import read_log
 from bayes_impedance.simulation.planning import Expectation, Plan
 

@@ -147,6 +147,14 @@ def test_quoted_figures_are_those_of_the_results() -> None:
     plain = table.replace("−", "-").replace(" %", "%")
     for figure in quoted:
         assert figure.replace(" %", "%") in plain, figure
+    told = " ".join(README.split("<!-- figures:")[0].split())
+    relative, absolute = core["demo"]["mean_relative_error"], core["demo"]["mean_absolute_error"]
+    for name in ("stiffness", "damping", "mass"):
+        assert (
+            f"{relative[f'{name}_xx']:.1%} and {relative[f'{name}_yy']:.1%} for {name}".replace("%", " %")
+            in told
+        )
+    assert "{stiffness_xy:.2g} N/m, {damping_xy:.2g} Ns/m and {mass_xy:.2g} kg".format(**absolute) in told
     faults = json.loads((ROOT / "results" / "faults.json").read_text(encoding="utf-8"))
     generated = f"{faults['generated']:,}".replace(",", " ")
     assert f"{generated} generated configurations" in " ".join(README.split())

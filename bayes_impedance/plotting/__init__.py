@@ -10,6 +10,5 @@ from bayes_impedance.plotting.impedance import plot_impedance as plot_impedance
 from bayes_impedance.plotting.over_time import plot_desired_trajectory as plot_desired_trajectory
 from bayes_impedance.plotting.over_time import plot_force as plot_force
 from bayes_impedance.plotting.panels import save_figure as save_figure
-from bayes_impedance.plotting.plans import MARKERS as MARKERS
 from bayes_impedance.plotting.plans import plot_plan as plot_plan
 from bayes_impedance.plotting.recordings import plot_recording as plot_recording

@@ -85,7 +85,7 @@ def evenly_spaced(abscissa: Array, count: int) -> NDArray[np.int64]:
 
     Example:
         >>> evenly_spaced(np.linspace(0.0, 1.0, 101), 4).tolist()
-        [12, 38, 62, 88]
+        [12, 37, 62, 87]
     """
     low, high = abscissa.min(), abscissa.max()
     middles = low + (high - low) * (np.arange(count) + 0.5) / count

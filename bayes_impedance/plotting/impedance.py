@@ -30,7 +30,7 @@ def plot_impedance(posterior: Posterior, verdicts: Iterable[Verdict], trial: int
     """
     axes, pairs = posterior.axes, posterior.pairs
     columns = len(axes) + len(pairs)
-    width = 4.6 if columns < 3 else 3.7
+    width = 4.6 if columns < 3 else 4.0
     figure, grid = panel_grid(len(IMPEDANCE_ORDER), columns, sharex="all", sharey="none", width=width)
     said = {(verdict.latent, verdict.axis): verdict for verdict in verdicts}
     record, rows = posterior.log.trials[trial], posterior.trial_slice(trial)
