@@ -8,7 +8,7 @@ these data, weakly, or prior only.
     from bayes_impedance import ImpedanceModel, read_log
 
     log = read_log("demo/training.csv")
-    model = ImpedanceModel.from_config("admittance", ["preprocessing.rate=12.5"]).fit(log)
+    model = ImpedanceModel.from_config("arm").fit(log)
     posterior = model.posterior(log)
     print(posterior["stiffness"].mean[:3], model.verdicts()[0].sentence)
 
@@ -19,7 +19,9 @@ Two levels:
   scores it on another log, `cross_validate` on parts of its own; `prior_sensitivity` tells what rests on a prior;
   `save_model` and `load_model` keep it. Each failure that input can cause is a `BayesImpedanceError`.
 - Under it: `bayes_impedance.kernels` are ordinary gpytorch kernels (`ImpedanceKernel`, `PDKernel`,
-  `InteractionKernel`) for models of one's own; `bayes_impedance.engines` computes exact likelihoods with them.
+  `InteractionKernel`) for models of one's own; `bayes_impedance.engines` computes exact likelihoods
+  with them, and given impedance by engines whose cost grows with the length of the log;
+  `bayes_impedance.impedance_functions` finds impedance as a function.
 
 The formulas are in docs/model.md, whose section numbers the docstrings quote. Everything is in SI units.
 """

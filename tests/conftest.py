@@ -39,15 +39,15 @@ def shared_data() -> Path:
 
 
 @pytest.fixture
-def full_disk() -> Callable[[], AbstractContextManager[None]]:
-    """Within `with full_disk():` no file grows beyond 4 kB; a limit of file size stands in for a full disk."""
+def full_disk() -> Callable[..., AbstractContextManager[None]]:
+    """Within `with full_disk():` no file grows beyond 4 kB, or what is asked for; that stands in for a full disk."""
     resource = pytest.importorskip("resource", reason="limits of file size are for Unix")
 
     @contextmanager
-    def limited() -> Iterator[None]:
+    def limited(size: int = 4096) -> Iterator[None]:
         soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
         # Python ignores the signal that comes with it.
-        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
         try:
             yield
         finally:

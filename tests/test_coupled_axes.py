@@ -17,7 +17,6 @@ from oracles import configuration
 from bayes_impedance import sensitivity
 from bayes_impedance.baselines.naive import NaiveModel
 from bayes_impedance.config import load_config, parse_config
-from bayes_impedance.coupled_posterior import LogTerms
 from bayes_impedance.errors import ConfigurationError, TooManySamplesError
 from bayes_impedance.evaluation.cross_validation import cross_validate
 from bayes_impedance.evaluation.held_out import evaluate
@@ -31,6 +30,7 @@ from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.persistence import load_model, save_model
 from bayes_impedance.posterior import Posterior, compute_posterior, draw_matrices, matrix_marginals
+from bayes_impedance.posterior.coupled import LogTerms
 from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.priors import ForceModel, build_force_model
 from bayes_impedance.simulation.generative import as_recording, draw_force, repeated_motion

@@ -170,6 +170,13 @@ PLOTTING = (
     "plotting.files",
     "plotting",
 )
+POSTERIOR = (
+    "posterior.conditioning",
+    "posterior.independent",
+    "posterior.coupled",
+    "posterior.compute",
+    "posterior",
+)
 COMMANDS = (
     "commands.inspection_tables",
     "commands.inspect",
@@ -195,9 +202,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             set(ENGINES),
             IMPEDANCE_FUNCTIONS,
             {"training"},
-            {"conditioning"},
-            {"independent_posterior", "coupled_posterior"},
-            {"posterior"},
+            POSTERIOR,
             set(FITTED_FUNCTIONS),
             {
                 "identifiability",
@@ -229,6 +234,7 @@ FAMILIES = (
     KERNELS,
     ENGINES,
     IMPEDANCE_FUNCTIONS,
+    POSTERIOR,
     FITTED_FUNCTIONS,
     BASELINES,
     SIMULATION,

@@ -376,7 +376,8 @@ def test_other_recordings_and_settings_are_not_continued(tiny, config, path):
 
 def test_full_disk_does_not_stop_training(tiny, config, path, full_disk):
     expected = state(ImpedanceModel(config).fit(tiny.fitted.fitted.log))
-    with full_disk(), warnings.catch_warnings(record=True) as caught:
+    # Room for the configuration, which begins the journal, and a few evaluations.
+    with full_disk(5120), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         assert state(fit(tiny, config, path)) == expected
     assert [entry.category for entry in caught] == [JournalWarning]

@@ -322,7 +322,7 @@ def test_long_targets_are_taken_in_pieces(monkeypatch: pytest.MonkeyPatch) -> No
     config = configuration(**DESIGNS["levels_learned"])
     log = group_log(config, seed=5)
     whole = ImpedanceModel(config).posterior(log)
-    monkeypatch.setattr("bayes_impedance.conditioning.CHUNK", 7)
+    monkeypatch.setattr("bayes_impedance.posterior.conditioning.CHUNK", 7)
     assert_equal_posteriors(ImpedanceModel(config).posterior(log), whole, rtol=1e-10)
 
 

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bayes_impedance.conditioning import Moments, select_groups
 from bayes_impedance.config import Config
 from bayes_impedance.features import Features
 from bayes_impedance.impedance_functions.conditioned import Conditioned
@@ -17,9 +16,10 @@ from bayes_impedance.impedance_functions.fit import Mode, find_weights
 from bayes_impedance.impedance_functions.function import build_functions
 from bayes_impedance.impedance_functions.log_matrix import LogMatrix
 from bayes_impedance.impedance_functions.train import FittedFunctions, build_density
-from bayes_impedance.independent_posterior import prior_only
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
 from bayes_impedance.posterior import Marginal, Posterior, by_sample, marginal_of
+from bayes_impedance.posterior.conditioning import Moments, select_groups
+from bayes_impedance.posterior.independent import prior_only
 from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.priors import ForceModel
 

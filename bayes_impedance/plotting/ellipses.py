@@ -24,7 +24,8 @@ from bayes_impedance.plotting.panels import (
     label_panel,
     panel_grid,
 )
-from bayes_impedance.posterior import UNITS, Posterior, draw_matrices
+from bayes_impedance.posterior import Posterior, draw_matrices
+from bayes_impedance.posterior.compute import UNITS
 from bayes_impedance.preprocessing import PreparedTrial
 
 Array = NDArray[np.float64]

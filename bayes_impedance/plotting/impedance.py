@@ -20,7 +20,8 @@ from bayes_impedance.plotting.panels import (
     logarithmic,
     panel_grid,
 )
-from bayes_impedance.posterior import UNITS, Marginal, Posterior
+from bayes_impedance.posterior import Marginal, Posterior
+from bayes_impedance.posterior.compute import UNITS
 
 
 def plot_impedance(posterior: Posterior, verdicts: Iterable[Verdict], trial: int = 0) -> Figure:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from bayes_impedance.conditioning import select_groups
 from bayes_impedance.engines.choice import EngineChoice
 from bayes_impedance.engines.given_impedance import LATENTS
 from bayes_impedance.errors import TooManySamplesError
@@ -18,6 +17,7 @@ from bayes_impedance.impedance_functions.posterior import condition
 from bayes_impedance.impedance_functions.train import FittedFunctions
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.model import ImpedanceModel
+from bayes_impedance.posterior.conditioning import select_groups
 from bayes_impedance.trajectory_mean import TrajectoryMean
 from tests.impedance_functions.problems import (
     COUPLED,

@@ -13,12 +13,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from bayes_impedance.conditioning import Moments, chunks, entry_of, offset_covariance, unwarped
 from bayes_impedance.engines.closed_loop import LoopEvidence
 from bayes_impedance.engines.dense import Factor
 from bayes_impedance.features import Features
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, TRAJECTORY_ORDER, InteractionKernel, Latent
 from bayes_impedance.kernels.warped import ImpedanceProcess
+from bayes_impedance.posterior.conditioning import Moments, chunks, entry_of, offset_covariance, unwarped
 from bayes_impedance.priors import ForceModel
 from bayes_impedance.training import observations
 

@@ -3,8 +3,8 @@
 The covariance between the force and another process is the primitive: predicting x_d is the same code as
 predicting u. Warped impedance is conditioned in the logarithm, so its quantiles are positive.
 
-Here is what users see; the conditioning itself is that of independent_posterior or, where axes are coupled, of
-coupled_posterior.
+Here is what users see; the conditioning itself is in `posterior.independent` or, where axes are coupled, in
+`posterior.coupled`.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 from torch import Tensor
 
-from bayes_impedance.conditioning import Moments, select_groups
-from bayes_impedance.coupled_posterior import CoupledConditioner, LogTerms, TermMoments
 from bayes_impedance.features import Features
-from bayes_impedance.independent_posterior import IndependentConditioner, is_warped, prior_only
 from bayes_impedance.kernels.coupled import CoupledInteractionKernel
 from bayes_impedance.kernels.coupled_terms import pair_names
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, InteractionKernel, Latent
+from bayes_impedance.posterior.conditioning import Moments, select_groups
+from bayes_impedance.posterior.coupled import CoupledConditioner, LogTerms, TermMoments
+from bayes_impedance.posterior.independent import IndependentConditioner, is_warped, prior_only
 from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.priors import ForceModel
 

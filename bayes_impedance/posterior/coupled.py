@@ -16,13 +16,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bayes_impedance.conditioning import Moments, chunks, entry_of, log_shift, offset_covariance
 from bayes_impedance.engines.coupled_loop import CoupledLoopEvidence
 from bayes_impedance.engines.dense import Factor
 from bayes_impedance.features import Features
 from bayes_impedance.kernels.coupled import CoupledInteractionKernel, by_axis, join_axes, rows_of
 from bayes_impedance.kernels.coupled_terms import CoupledProcess, term_directions
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, TRAJECTORY_ORDER, Latent
+from bayes_impedance.posterior.conditioning import Moments, chunks, entry_of, log_shift, offset_covariance
 from bayes_impedance.priors import ForceModel
 from bayes_impedance.training import observations
 
