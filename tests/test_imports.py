@@ -147,6 +147,7 @@ ENGINES = (
     "engines",
 )
 IMPEDANCE_FUNCTIONS = (
+    "impedance_functions.threads",
     "impedance_functions.symmetric",
     "impedance_functions.log_matrix",
     "impedance_functions.inducing",

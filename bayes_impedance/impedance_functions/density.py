@@ -18,7 +18,8 @@ from bayes_impedance.priors import Entry, ForceModel
 
 Array = NDArray[np.float64]
 
-#: What steps away from the anchor cost: a hyperprior of this SD, in unconstrained values.
+#: How far from the anchor a tilt is trusted, in unconstrained values: it fades beyond, and steps cost what a hyperprior
+#: of this SD would.
 TRUSTED = 2.0
 #: Hyperparameters of the impedance's own priors: functions carry their levels, and evidence finds the others.
 OF_IMPEDANCE = ("stiffness.", "damping.", "mass.")
@@ -95,9 +96,9 @@ class Density:
         moves = [entry.free.repeat(entry.raw.shape[0]).numpy() for entry in self.entries]
         #: Coordinates that are learned: all but components that the configuration fixes.
         self.free = np.concatenate([np.ones(self.weight_count, dtype=bool), *moves])
-        #: Gradient of a linear term, by which the uncertainty of the weights enters (see `evidence.occam`), and the
-        #: hyperparameters at which it was found: it is local, so a step away from them costs something. Where turns
-        #: have settled that cost is none.
+        #: Gradient of a term by which the uncertainty of the weights enters (see `evidence.occam`), and the
+        #: hyperparameters at which it was found: it is local, so it fades away from them, and a step costs something.
+        #: Where turns have settled that cost is none.
         self.tilt = np.zeros(len(self.free))
         self.anchor: Array | None = None
         self.renew()
@@ -149,8 +150,10 @@ class Density:
         away = np.zeros_like(point)
         if self.anchor is not None:
             away[self.weight_count :] = (point - self.anchor)[self.weight_count :] / TRUSTED
-        tilted = value + float(self.tilt @ point) - 0.5 * float(away @ away)
-        return tilted, (gradient + self.tilt - away / TRUSTED) * self.free
+        # A linear term would drive noise without bound where weights outnumber forces.
+        bounded = np.tanh(away)
+        tilted = value + TRUSTED * float(self.tilt @ bounded) - 0.5 * float(away @ away)
+        return tilted, (gradient + self.tilt * (1.0 - bounded**2) - away / TRUSTED) * self.free
 
     def joint(self, point: Array) -> tuple[float, Array]:
         """Log density of forces, weights and hyperparameters, without constants of the priors, and its gradient.

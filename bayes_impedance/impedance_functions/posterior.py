@@ -15,6 +15,7 @@ from bayes_impedance.impedance_functions.density import Density
 from bayes_impedance.impedance_functions.fit import Mode, find_weights
 from bayes_impedance.impedance_functions.function import build_functions
 from bayes_impedance.impedance_functions.log_matrix import LogMatrix
+from bayes_impedance.impedance_functions.threads import one_thread
 from bayes_impedance.impedance_functions.train import FittedFunctions, build_density
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
 from bayes_impedance.posterior import Marginal, Posterior, by_sample, marginal_of
@@ -26,6 +27,7 @@ from bayes_impedance.priors import ForceModel
 Array = NDArray[np.float64]
 
 
+@one_thread()
 def condition(
     config: Config, model: ForceModel, fitted: FittedFunctions, given: Features, trained_on: bool
 ) -> Conditioned:
@@ -50,6 +52,7 @@ def condition(
     return Conditioned(density, mode.point, mode.covariance, density.free)
 
 
+@one_thread()
 def function_evidence(config: Config, model: ForceModel, fitted: FittedFunctions, given: Features) -> float:
     """log p(forces of `given`) at the hyperparameters, the functions integrated out by Laplace's method [nats].
 
@@ -74,6 +77,7 @@ def _mode_of_weights(config: Config, density: Density, fitted: FittedFunctions) 
     )
 
 
+@one_thread()
 def compute_function_posterior(
     config: Config,
     model: ForceModel,

@@ -20,6 +20,7 @@ from bayes_impedance.features import Features
 from bayes_impedance.impedance_functions.density import Density, beside_impedance
 from bayes_impedance.impedance_functions.fit import Mode, find_mode
 from bayes_impedance.impedance_functions.function import build_functions, choose_inducing
+from bayes_impedance.impedance_functions.threads import one_thread
 from bayes_impedance.priors import ForceModel
 from bayes_impedance.training import Progress, RestartReport, TrainingReport
 
@@ -71,6 +72,7 @@ def expected_sizes(config: Config, model: ForceModel, fitted: FittedFunctions) -
     return size, free
 
 
+@one_thread()
 def train_functions(
     config: Config, model: ForceModel, features: Features, progress: Progress | None = None
 ) -> tuple[FittedFunctions, TrainingReport]:

@@ -29,6 +29,7 @@ def test_gradient_is_finite_differences(engine, overrides, groups):
     assert (problem.features.valid is not None) == (groups > 1)
     generator = np.random.default_rng(1)
     density.tilt = density.free * generator.standard_normal(len(density.free))
+    density.tilt[: density.weight_count] = 0.0
     density.anchor = density.start() + 0.1
     point = somewhere(density)
     _, gradient = density(point)
@@ -63,14 +64,17 @@ def test_coupled_axes_without_coupling_are_independent():
     assert mine.joint(together)[0] == pytest.approx(its.joint(point)[0], rel=1e-6)
 
 
-def test_tilt_is_linear_and_anchor_a_hyperprior():
+def test_tilt_is_local_and_anchor_a_hyperprior():
     density = density_of(small_problem())
     point = somewhere(density)
     value, gradient = density(point)
     assert value == density.joint(point)[0]
-    density.tilt[-1] = 3.0
-    assert density(point)[0] == pytest.approx(value + 3.0 * point[-1], rel=1e-12)
+    density.tilt[-1], density.anchor = 3.0, point
+    assert density(point)[0] == value
     assert density(point)[1][-1] == pytest.approx(gradient[-1] + 3.0, rel=1e-12)
+    # Far away it is worth no more than this.
+    density.anchor = point - 20.0 * TRUSTED * (np.arange(len(point)) == len(point) - 1)
+    assert density(point)[0] == pytest.approx(value + 3.0 * TRUSTED - 200.0, rel=1e-12)
     density.tilt[-1] = 0.0
     density.anchor = point - TRUSTED * (np.arange(len(point)) == len(point) - 1)
     assert density(point)[0] == pytest.approx(value - 0.5, rel=1e-12)

@@ -10,6 +10,7 @@ from bayes_impedance.errors import NotPositiveDefiniteError
 from bayes_impedance.features import FeatureMap
 from bayes_impedance.impedance_functions import fit, laplace, train
 from bayes_impedance.impedance_functions.fit import find_mode, find_weights
+from bayes_impedance.impedance_functions.threads import one_thread
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.priors import build_force_model
 from bayes_impedance.trajectory_mean import TrajectoryMean
@@ -287,3 +288,11 @@ def test_ctrl_c_in_the_second_restart_keeps_the_first(quick):
     assert found.fitted.functions.point.tobytes() == quick[0].fitted.functions.point.tobytes()
     for mine, its in zip(found.hyperparameters, quick[0].hyperparameters, strict=True):
         assert torch.equal(mine.raw, its.raw)
+
+
+def test_threads_are_one_within_and_as_many_as_before_after():
+    before = torch.get_num_threads()
+    with pytest.raises(KeyboardInterrupt), one_thread():
+        assert torch.get_num_threads() == 1
+        raise KeyboardInterrupt
+    assert torch.get_num_threads() == before

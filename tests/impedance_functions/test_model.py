@@ -206,10 +206,6 @@ def test_plans_are_of_moments(fitted):
     ("overrides", "sentence"),
     [
         (
-            ("model.axes=coupled", "device.mass=2", "engine.impedance=moments"),
-            r"device: with model\.axes: coupled the Jacobian of the closed loop is the determinant of a matrix",
-        ),
-        (
             ("model.mass.input=[position]", "engine.impedance=moments"),
             r"model\.mass\.input: expected no input with engine\.impedance: moments, .* got position; set engine",
         ),
