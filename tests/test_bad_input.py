@@ -525,7 +525,7 @@ CASES: dict[str, tuple[Callable[[Bench], Arguments], tuple[str, ...]]] = {
         lambda bench: bench.evaluate(bench.other, "--against", "fase"),
         (
             "--against: expected a model folder, a YAML file or the name of a shipped configuration, found none",
-            "at 'fase'; shipped are admittance, coupled, phase, ",
+            "at 'fase'; shipped are admittance, arm, coupled, phase, ",
         ),
     ),
     "competitor that is no model folder": (

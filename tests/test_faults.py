@@ -229,7 +229,7 @@ def test_full_disk_loses_no_training(command, tiny, place, full_disk, monkeypatc
     """The journal fills up, then the model cannot be written; with room made, --resume writes it."""
     arguments = ("train", tiny.log, *settings(), "--out", place / "model")
     (place / "model" / "mine").write_text("a trace of the old one")
-    with full_disk():
+    with full_disk(5120):
         done = command(*arguments)
     assert done.code == 2
     warning, error = done.err.splitlines()

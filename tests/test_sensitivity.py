@@ -111,7 +111,9 @@ def acts(config: Config, key: str) -> bool:
     if rest == ["shape"]:
         return model.desired_trajectory.kernel == "rational_quadratic"
     if rest == ["coupling"]:
-        return model.axes == "coupled"
+        return model.axes == "coupled" and config.engine.impedance == "moments"
+    if section == "mass" and rest in (["sd"], ["log_sd"]):
+        return bool(model.mass.input) == (rest == ["log_sd"])
     if rest[:1] != ["length_scale"]:
         return True
     if section == "desired_trajectory":

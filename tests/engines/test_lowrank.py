@@ -374,7 +374,10 @@ def test_too_many_features_are_refused(name, coupled):
 
 def test_too_many_features_of_a_periodic_phase_are_refused():
     given = given_problem(
-        "phase", (*PLAIN, "model.desired_trajectory.periodic=true"), repetitions=2, rate=6.0
+        "phase",
+        (*PLAIN, "engine.impedance=map", "model.desired_trajectory.periodic=true"),
+        repetitions=2,
+        rate=6.0,
     )
     assert unsupported(given.processes, given.features) is None
     given.processes.trajectory.lengthscale = 1e-4

@@ -15,6 +15,7 @@ from tests.engines.given import NO_RESIDUAL, given_problem
 
 PERIODIC = (
     "model.desired_trajectory.kernel=squared_exponential",
+    "engine.impedance=map",
     "model.desired_trajectory.periodic=true",
 )
 OVER_TIME = ("model.residual.kernel=squared_exponential", "model.residual.input=[time]")
