@@ -43,6 +43,14 @@ class Features:
     rows: tuple[NDArray[np.int64], ...]
     loop: Loop | None = None
 
+    @property
+    def counts(self) -> Tensor:
+        """Samples of each group, padding left out, `(groups,)`."""
+        groups, n = self.inputs.shape[1:3]
+        return (
+            self.inputs.new_full((groups,), n) if self.valid is None else self.valid.sum(-1).to(self.inputs)
+        )
+
 
 class FeatureMap:
     """Layout of the inputs that a configuration asks for, and the map from samples to them."""

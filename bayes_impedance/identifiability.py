@@ -10,7 +10,7 @@ import numpy as np
 
 from bayes_impedance.config import Config
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
-from bayes_impedance.posterior import Posterior
+from bayes_impedance.posterior import Marginal, Posterior
 from bayes_impedance.posterior.compute import UNITS
 from bayes_impedance.preprocessing import PreparedTrial
 
@@ -73,14 +73,21 @@ def off_diagonals(posterior: Posterior) -> list[OffDiagonal]:
     """What couples axes in stiffness, damping and mass, averaged over samples; nothing where axes are independent."""
     listed = []
     for latent, marginal in posterior.couplings.items():
-        bands = [marginal.quantile(p) for p in (0.05, 0.95)]
-        bands += [marginal.prior_quantile(p) for p in (0.05, 0.95)]
-        averages = np.stack([marginal.mean, *bands]).mean(axis=1)
-        for k, pair in enumerate(posterior.pairs):
-            mean, low, high, prior_low, prior_high = averages[:, k].tolist()
-            contraction = float(marginal.contraction[k])
-            listed.append(OffDiagonal(latent, pair, mean, low, high, prior_low, prior_high, contraction))
+        for pair, average in zip(posterior.pairs, _path_averages(marginal), strict=True):
+            listed.append(OffDiagonal(latent, pair, *average))
     return listed
+
+
+def _path_averages(marginal: Marginal) -> list[tuple[float, float, float, float, float, float]]:
+    """Mean, 5 and 95 % quantiles, those of the prior, and contraction: averages over samples, one for each column."""
+    bands = [quantile(p) for quantile in (marginal.quantile, marginal.prior_quantile) for p in (0.05, 0.95)]
+    columns = []
+    for k, contraction in enumerate(marginal.contraction):
+        mean, low, high, prior_low, prior_high = (
+            float(part[:, k].mean()) for part in (marginal.mean, *bands)
+        )
+        columns.append((mean, low, high, prior_low, prior_high, float(contraction)))
+    return columns
 
 
 def assess(
@@ -95,26 +102,11 @@ def assess(
     confounded = confounding(config, repetitions, perturbed)
     verdicts = []
     for latent in IMPEDANCE_ORDER:
-        marginal = posterior[latent]
-        low, high = marginal.quantile(0.05), marginal.quantile(0.95)
-        prior_low, prior_high = marginal.prior_quantile(0.05), marginal.prior_quantile(0.95)
-        for a, axis in enumerate(posterior.axes):
-            contraction = float(marginal.contraction[a])
+        for axis, average in zip(posterior.axes, _path_averages(posterior[latent]), strict=True):
+            contraction = average[-1]
             support = classify(contraction) if confounded is None else Support.PRIOR_ONLY
-            verdicts.append(
-                Verdict(
-                    latent,
-                    axis,
-                    float(marginal.mean[:, a].mean()),
-                    float(low[:, a].mean()),
-                    float(high[:, a].mean()),
-                    float(prior_low[:, a].mean()),
-                    float(prior_high[:, a].mean()),
-                    contraction,
-                    support,
-                    _sentence(latent, axis, contraction, support, confounded, posterior),
-                )
-            )
+            sentence = _sentence(latent, axis, contraction, support, confounded, posterior)
+            verdicts.append(Verdict(latent, axis, *average, support, sentence))
     return verdicts
 
 

@@ -188,23 +188,25 @@ class ImpedanceModel:
         """
         prepared = self.prepare(log)
         evidence = self._evidence(prepared, given)
-        if self._is_function:
-            return self._function_posterior(prepared, evidence, latents)
+        functions = self._functions if self._is_function else None
         feature_map = FeatureMap(self.config, prepared.axes)
         mean = self._mean(prepared)
         conditions = None
         # One labelling for both, so that a trial that is target and evidence keeps its own x_d and ũ.
         labels = label_trials(*([prepared] if evidence is None else [prepared, evidence]))
         if evidence is not None:
-            self._check_capacity(evidence)
+            if functions is None:
+                self._check_capacity(evidence)
             conditions = feature_map(evidence, mean, labels, observed=True)
-        return compute_posterior(
-            self._force_model(feature_map),
-            prepared,
-            feature_map(prepared, mean, labels),
-            conditions,
-            self.config.engine.jitter,
-            latents,
+        target = feature_map(prepared, mean, labels)
+        model = self._force_model(feature_map)
+        if functions is None:
+            return compute_posterior(model, prepared, target, conditions, self.config.engine.jitter, latents)
+        conditioned = None
+        if evidence is not None and conditions is not None:
+            conditioned = condition(self.config, model, functions, conditions, self._is_training(evidence))
+        return compute_function_posterior(
+            self.config, model, functions, prepared, target, conditioned, latents
         )
 
     def point_predictor(self, axis: str, group: str) -> PointPredictor:
@@ -307,21 +309,6 @@ class ImpedanceModel:
     @property
     def _is_function(self) -> bool:
         return self.config.engine.impedance == "map"
-
-    def _function_posterior(
-        self, log: PreparedLog, evidence: PreparedLog | None, latents: Sequence[Latent] | None
-    ) -> Posterior:
-        functions = self._functions
-        feature_map = FeatureMap(self.config, log.axes)
-        mean = self._mean(log)
-        labels = label_trials(*([log] if evidence is None else [log, evidence]))
-        model = self._force_model(feature_map)
-        conditioned = None
-        if evidence is not None:
-            given = feature_map(evidence, mean, labels, observed=True)
-            conditioned = condition(self.config, model, functions, given, self._is_training(evidence))
-        target = feature_map(log, mean, labels)
-        return compute_function_posterior(self.config, model, functions, log, target, conditioned, latents)
 
     def _is_training(self, evidence: PreparedLog) -> bool:
         """Whether these are all the forces of some of the groups that the model was trained on."""

@@ -12,8 +12,9 @@ from bayes_impedance.engines.given_impedance import (
     LATENTS,
     MeanAndVariance,
     Processes,
-    diagonal_only,
+    as_read,
     mean_force,
+    prior_mean,
 )
 from bayes_impedance.errors import NotPositiveDefiniteError
 from bayes_impedance.features import Features
@@ -37,7 +38,7 @@ class DenseGivenImpedance:
         Raises:
             NotPositiveDefiniteError: no Cholesky factor at this jitter.
         """
-        cholesky, residual = self._factor(processes, self._known(impedance))
+        cholesky, residual = self._factor(processes, as_read(impedance, self.coupled))
         white = torch.linalg.solve_triangular(cholesky, residual.unsqueeze(-1), upper=False)[..., 0]
         log_det = 2.0 * cholesky.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         return -0.5 * (white.square().sum(-1) + log_det + self._count() * math.log(2.0 * math.pi))
@@ -50,7 +51,10 @@ class DenseGivenImpedance:
         Raises:
             NotPositiveDefiniteError: no Cholesky factor at this jitter.
         """
-        impedance, target_impedance = self._known(impedance), self._known(target_impedance)
+        impedance, target_impedance = (
+            as_read(impedance, self.coupled),
+            as_read(target_impedance, self.coupled),
+        )
         with torch.no_grad():
             cholesky, residual = self._factor(processes, impedance)
             alpha = torch.cholesky_solve(residual.unsqueeze(-1), cholesky)
@@ -61,19 +65,13 @@ class DenseGivenImpedance:
                 own = self._variance(processes, target, target_impedance, latent)
                 shift = self._per_axis((cross.mT @ alpha)[..., 0], own.shape)
                 known = self._per_axis(white.square().sum(-2), own.shape)
-                location = shift + _prior_mean(processes, target, target_impedance, latent)
+                location = shift + prior_mean(processes.layout, target, target_impedance, latent)
                 result[latent] = (location, (own - known).clamp_min(0.0))
         return result
 
-    def _known(self, impedance: Tensor) -> Tensor:
-        return impedance if self.coupled else diagonal_only(impedance)
-
     def _count(self) -> Tensor:
-        inputs = self.features.inputs
-        axes, groups, n = inputs.shape[:3]
-        valid = self.features.valid
-        count = inputs.new_full((groups,), n) if valid is None else valid.sum(-1).to(inputs)
-        return count * axes if self.coupled else count
+        counts = self.features.counts
+        return counts * self.features.inputs.shape[0] if self.coupled else counts
 
     def _factor(self, processes: Processes, impedance: Tensor) -> tuple[Tensor, Tensor]:
         features = self.features
@@ -153,14 +151,6 @@ class DenseGivenImpedance:
             return residual
         stacked = _stack(common, table, x.shape[:-1])
         return torch.einsum("gniac,ijcgn,gnjac->agn", impedance, stacked, impedance) + residual
-
-
-def _prior_mean(processes: Processes, target: Features, impedance: Tensor, latent: Latent) -> Tensor:
-    if latent is Latent.FORCE:
-        return mean_force(processes.layout, target, impedance)
-    if latent is Latent.RESIDUAL_FORCE:
-        return target.inputs.new_zeros(target.inputs.shape[:-1])
-    return target.trajectory_mean[..., TRAJECTORY_ORDER[latent]]
 
 
 def _trajectory(processes: Processes, x1: Tensor, x2: Tensor) -> Tensor:

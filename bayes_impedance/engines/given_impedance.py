@@ -19,7 +19,7 @@ from gpytorch.kernels import AdditiveKernel, Kernel
 from torch import Tensor
 
 from bayes_impedance.features import Features
-from bayes_impedance.kernels.impedance import InputLayout, Latent
+from bayes_impedance.kernels.impedance import TRAJECTORY_ORDER, InputLayout, Latent
 from bayes_impedance.kernels.stationary import StationaryKernel
 from bayes_impedance.priors import ForceModel
 
@@ -97,11 +97,20 @@ def mean_force(layout: InputLayout, features: Features, impedance: Tensor) -> Te
     return torch.einsum("gnjab,bgnj->agn", impedance, stacked)
 
 
+def prior_mean(layout: InputLayout, target: Features, impedance: Tensor, latent: Latent) -> Tensor:
+    """Mean of a latent of `LATENTS` before any force, `(axes, groups, m)`; `impedance` at the samples of `target`."""
+    if latent is Latent.FORCE:
+        return mean_force(layout, target, impedance)
+    if latent is Latent.RESIDUAL_FORCE:
+        return target.inputs.new_zeros(target.inputs.shape[:-1])
+    return target.trajectory_mean[..., TRAJECTORY_ORDER[latent]]
+
+
 def diagonal_only(impedance: Tensor) -> Tensor:
     """The same matrices without what couples axes."""
     return torch.diag_embed(impedance.diagonal(dim1=-2, dim2=-1))
 
 
-def sum_over_axes(values: Tensor, coupled: bool) -> Tensor:
-    """`(axes, groups)` as engines return it: one row where axes couple."""
-    return values.sum(0, keepdim=True) if coupled else values
+def as_read(impedance: Tensor, coupled: bool) -> Tensor:
+    """The matrices as an engine reads them: only diagonals where axes do not couple."""
+    return impedance if coupled else diagonal_only(impedance)

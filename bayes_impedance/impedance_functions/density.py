@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,6 +49,21 @@ def beside_impedance(model: ForceModel) -> list[Entry]:
     return [
         entry for entry in model.entries if bool(entry.free.any()) and not entry.name.startswith(OF_IMPEDANCE)
     ]
+
+
+def pack(entries: Sequence[Entry]) -> Array:
+    """Unconstrained values of hyperparameters, one after another."""
+    return np.concatenate([np.zeros(0), *(entry.raw.detach().reshape(-1).numpy() for entry in entries)])
+
+
+def unpack(entries: Sequence[Entry], point: Array) -> None:
+    """Write what `pack` gave back into the hyperparameters."""
+    start = 0
+    with torch.no_grad():
+        for entry in entries:
+            stop = start + entry.raw.numel()
+            entry.raw.copy_(torch.from_numpy(point[start:stop]).reshape(entry.raw.shape))
+            start = stop
 
 
 def log_jacobian(loop: Loop, impedance: Tensor, valid: Tensor | None, coupled: bool) -> Tensor:
@@ -109,8 +125,7 @@ class Density:
 
     def start(self) -> Array:
         """Weights at their prior mean, hyperparameters where the model stands."""
-        raws = [entry.raw.detach().reshape(-1).numpy() for entry in self.entries]
-        return np.concatenate([np.zeros(self.weight_count), *raws])
+        return np.concatenate([np.zeros(self.weight_count), pack(self.entries)])
 
     def weights(self, point: Tensor) -> tuple[Tensor, ...]:
         """Weights of each function, `(groups, entries, width)`."""
@@ -120,12 +135,7 @@ class Density:
 
     def set_hyperparameters(self, point: Array) -> None:
         """Write those of `point` into the model."""
-        start = self.weight_count
-        with torch.no_grad():
-            for entry in self.entries:
-                stop = start + entry.raw.numel()
-                entry.raw.copy_(torch.from_numpy(point[start:stop]).reshape(entry.raw.shape))
-                start = stop
+        unpack(self.entries, point[self.weight_count :])
 
     @property
     def processes(self) -> Processes:

@@ -19,7 +19,7 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from bayes_impedance.impedance_functions import laplace
-from bayes_impedance.impedance_functions.density import OF_IMPEDANCE, Density, log_hyperprior
+from bayes_impedance.impedance_functions.density import OF_IMPEDANCE, Density, log_hyperprior, pack, unpack
 from bayes_impedance.impedance_functions.function import ImpedanceFunction
 from bayes_impedance.priors import Entry
 
@@ -87,13 +87,13 @@ def update_variation(density: Density, mode: Array, precision: Array) -> tuple[A
     if not entries:
         return mode, 0.0
     quadratic = _Quadratic(density, mode, precision)
-    start = _pack(entries)
+    start = pack(entries)
     scale = np.concatenate([np.tile(e.log_sds.numpy(), len(e.raw)) for e in entries])
     moves = np.concatenate([np.tile(e.free.numpy(), len(e.raw)) for e in entries])
     width = np.where(moves, LARGEST_MOVE * scale, 0.0)
 
     def objective(point: Array) -> tuple[float, Array]:
-        _unpack(entries, point)
+        unpack(entries, point)
         for entry in entries:
             entry.raw.grad = None
         value = quadratic.log_evidence() + log_variation_prior(density)
@@ -108,7 +108,7 @@ def update_variation(density: Density, mode: Array, precision: Array) -> tuple[A
         objective, start, jac=True, method="L-BFGS-B",
         bounds=list(zip(start - width, start + width, strict=True)),
     )  # fmt: skip
-    _unpack(entries, found.x)
+    unpack(entries, found.x)
     return quadratic.translated(mode), float(np.abs(_scaled_logarithms(entries) - before).max())
 
 
@@ -116,19 +116,6 @@ def _scaled_logarithms(entries: list[Entry]) -> Array:
     """Logarithms of the hyperparameters in log-SDs of their hyperpriors."""
     parts = [(entry.value.detach().log() / entry.log_sds).reshape(-1) for entry in entries]
     return torch.cat(parts).numpy()
-
-
-def _pack(entries: list[Entry]) -> Array:
-    return np.concatenate([entry.raw.detach().reshape(-1).numpy() for entry in entries])
-
-
-def _unpack(entries: list[Entry], point: Array) -> None:
-    start = 0
-    with torch.no_grad():
-        for entry in entries:
-            stop = start + entry.raw.numel()
-            entry.raw.copy_(torch.from_numpy(point[start:stop]).reshape(entry.raw.shape))
-            start = stop
 
 
 def _gradient(entry: Entry) -> Array:

@@ -84,9 +84,11 @@ class ImpedanceFunction:
         carried = design[..., 1:].square().sum(-1)
         return (self.scale.square()[:, None] * own - carried).clamp_min(0.0)
 
-    def prior(self, inputs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Location and covariance of S before any force, `(groups, n, entries)` and `(…, entries)`, given twice."""
-        design = self.design(inputs)
+    def prior(self, inputs: Tensor, design: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Location and covariance of S before any force, `(groups, n, entries)` and `(…, entries)`, given twice.
+
+        `design` at `inputs`.
+        """
         variance = (design.square().sum(-1) + self.left_out(inputs, design)).transpose(1, 2)
         location, covariance = self.location.expand_as(variance), torch.diag_embed(variance)
         return location, covariance, location, covariance

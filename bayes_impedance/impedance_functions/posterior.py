@@ -25,6 +25,8 @@ from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.priors import ForceModel
 
 Array = NDArray[np.float64]
+#: Location and covariance of the entries of a matrix logarithm, then those of their prior.
+LogMoments = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 @one_thread()
@@ -94,28 +96,29 @@ def compute_function_posterior(
     known = [g for g in given if g in target.groups]
     unknown = [g for g in target.groups if g not in known]
     others = [latent for latent in wanted if latent not in IMPEDANCE_ORDER]
+    orders = {latent: IMPEDANCE_ORDER[latent] for latent in wanted if latent in IMPEDANCE_ORDER}
+    functions = build_functions(config, model, fitted.inducing)
     parts: list[tuple[list[str], dict[Latent, Moments]]] = []
-    logarithms: list[tuple[list[str], list[tuple[torch.Tensor, ...]]]] = []
+    logarithms: list[tuple[list[str], dict[int, LogMoments]]] = []
     with torch.no_grad():
         if known:
             assert conditioned is not None
             own = select_groups(target, known)
             parts.append((known, _known_others(model, conditioned, own, others)))
-            logarithms.append((known, [conditioned.logarithm(own, j) for j in range(3)]))
+            logarithms.append((known, {j: conditioned.logarithm(own, j) for j in orders.values()}))
         if unknown:
             own = select_groups(target, unknown)
             parts.append((unknown, prior_only(model, own, others)))
-            functions = build_functions(config, model, fitted.inducing)
-            logarithms.append((unknown, [function.prior(own.inputs) for function in functions]))
+            x = own.inputs
+            before = {j: functions[j].prior(x, functions[j].design(x)) for j in orders.values()}
+            logarithms.append((unknown, before))
     marginals = {latent: marginal_of(model, log, target, latent, parts) for latent in others}
     couplings, laws = {}, {}
-    places = build_functions(config, model, fitted.inducing)[0].places
-    for latent in (latent for latent in wanted if latent in IMPEDANCE_ORDER):
-        j = IMPEDANCE_ORDER[latent]
+    for latent, j in orders.items():
         listed = [
             by_sample(log, target, [(chosen, found[j][i]) for chosen, found in logarithms]) for i in range(4)
         ]
-        law = LogMatrix(places, *listed)
+        law = LogMatrix(functions[j].places, *listed)
         laws[latent] = law
         marginals[latent] = Marginal(latent, True, *law.diagonal(), *law.diagonal(prior=True))
         if law.is_coupled:

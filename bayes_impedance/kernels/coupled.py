@@ -23,10 +23,8 @@ from torch import Tensor
 from bayes_impedance.kernels.coupled_terms import CoupledProcess, contract
 from bayes_impedance.kernels.derivative import derivative_table, multiply_add
 from bayes_impedance.kernels.impedance import (
-    IMPEDANCE_ORDER,
-    TRAJECTORY_ORDER,
     InputLayout,
-    Latent,
+    LatentCovariances,
     same_label,
 )
 from bayes_impedance.kernels.motion_noise import MotionNoiseKernel
@@ -235,7 +233,7 @@ class CoupledImpedanceKernel(Kernel):
         blocks = (self.loading(x, order) * weights)[..., 0]
         return blocks.movedim(1, -1).movedim(0, -2).flatten(-3, -2)
 
-    def term_covariance(self, x1: Tensor, x2: Tensor, order: int) -> Tensor:
+    def impedance_covariance(self, x1: Tensor, x2: Tensor, order: int) -> Tensor:
         """Cov[u_a, g_jr'], j = `order`: `loading` times k_r, `(*batch, n1 · axes, n2 · terms)` [N]."""
         product = self.loading(x1, order) * self.processes[order].gaussian_covariance(x1, x2)
         return _interleaved(product.expand(*product.shape[:-1], x2.shape[-2]))
@@ -249,7 +247,7 @@ class CoupledImpedanceKernel(Kernel):
                 )
 
 
-class CoupledInteractionKernel(Kernel):
+class CoupledInteractionKernel(LatentCovariances):
     """Coupled impedance plus a residual force of each axis [N²], `(*batch, n1 · axes, n2 · axes)`.
 
     Args:
@@ -309,25 +307,3 @@ class CoupledInteractionKernel(Kernel):
         k = evaluate(self.residual, x1, x2, diag)
         shared = same_label(x1, x2, self.impedance.layout.residual, diag)
         return (k if shared is None else k * shared).expand(shape)
-
-    def prior_mean(self, x: Tensor) -> Tensor:
-        """E[u], `(*batch, n · axes)` [N]."""
-        return self.impedance.prior_mean(x)
-
-    def cross_covariance(self, x1: Tensor, x2: Tensor, latent: Latent) -> Tensor:
-        """Cov[u(x1), latent(x2)], `(*batch, n1 · axes, n2 · axes)`; of impedance its terms, `(…, n2 · terms)`."""
-        if latent is Latent.FORCE:
-            return self.forward(x1, x2)
-        if latent is Latent.RESIDUAL_FORCE:
-            return self.residual_covariance(x1, x2)
-        if latent in TRAJECTORY_ORDER:
-            return self.impedance.trajectory_covariance(x1, x2, TRAJECTORY_ORDER[latent])
-        return self.impedance.term_covariance(x1, x2, IMPEDANCE_ORDER[latent])
-
-    def prior_variance(self, x: Tensor, latent: Latent) -> Tensor:
-        """Prior variance of a latent that is no impedance, `(*batch, n · axes)`."""
-        if latent is Latent.FORCE:
-            return self.forward(x, x, diag=True)
-        if latent is Latent.RESIDUAL_FORCE:
-            return self.residual_covariance(x, x, diag=True)
-        return self.impedance.trajectory_variance(x, TRAJECTORY_ORDER[latent])

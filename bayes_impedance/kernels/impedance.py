@@ -8,6 +8,7 @@ With w = (k, d, m), ē_j = E[e⁽ʲ⁾] and C_ij = Cov[w_i, w_j'], independent o
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -279,7 +280,42 @@ def PDKernel(  # noqa: N802 - named as the kernel it builds
     return ImpedanceKernel(layout, trajectory, stiffness, damping, mass=None, active_dims=active_dims)
 
 
-class InteractionKernel(BatchedKernel):
+class LatentCovariances(Kernel):
+    """What interaction kernels share: covariances of the force with every latent, from those of its parts.
+
+    `impedance` is the kernel of the impedance force. Shapes are those of the kernel's own covariance.
+    """
+
+    impedance: Any
+
+    @abstractmethod
+    def residual_covariance(self, x1: Tensor, x2: Tensor, diag: bool = False) -> Tensor:
+        """k_ũ, zero between samples whose residual labels differ [N²]."""
+
+    def prior_mean(self, x: Tensor) -> Tensor:
+        """E[u], one for each row of the covariance [N]."""
+        return self.impedance.prior_mean(x)
+
+    def cross_covariance(self, x1: Tensor, x2: Tensor, latent: Latent) -> Tensor:
+        """Cov[u(x1), latent(x2)]; warped impedance enters by its logarithm (docs/model.md §4), or by its terms."""
+        if latent is Latent.FORCE:
+            return self.forward(x1, x2)
+        if latent is Latent.RESIDUAL_FORCE:
+            return self.residual_covariance(x1, x2)
+        if latent in TRAJECTORY_ORDER:
+            return self.impedance.trajectory_covariance(x1, x2, TRAJECTORY_ORDER[latent])
+        return self.impedance.impedance_covariance(x1, x2, IMPEDANCE_ORDER[latent])
+
+    def prior_variance(self, x: Tensor, latent: Latent) -> Tensor:
+        """Prior variance of a latent that is no impedance."""
+        if latent is Latent.FORCE:
+            return self.forward(x, x, diag=True)
+        if latent is Latent.RESIDUAL_FORCE:
+            return self.residual_covariance(x, x, diag=True)
+        return self.impedance.trajectory_variance(x, TRAJECTORY_ORDER[latent])
+
+
+class InteractionKernel(LatentCovariances, BatchedKernel):
     """Impedance plus residual force: the paper's interaction kernel (15) without its noise [N²].
 
     σ_r² belongs to the likelihood, as gpytorch has it.
@@ -331,30 +367,12 @@ class InteractionKernel(BatchedKernel):
         shared = same_label(x1, x2, self.impedance.layout.residual, diag)
         return k if shared is None else k * shared
 
-    def prior_mean(self, x: Tensor) -> Tensor:
-        """E[u], `(..., n)` [N]."""
-        return self.impedance.prior_mean(x)
-
-    def cross_covariance(self, x1: Tensor, x2: Tensor, latent: Latent) -> Tensor:
-        """Cov[u(x1), latent(x2)], `(..., n1, n2)`; warped impedance enters by its logarithm (docs/model.md §4)."""
-        if latent is Latent.FORCE:
-            return self.forward(x1, x2)
-        if latent is Latent.RESIDUAL_FORCE:
-            return self.residual_covariance(x1, x2)
-        if latent in TRAJECTORY_ORDER:
-            return self.impedance.trajectory_covariance(x1, x2, TRAJECTORY_ORDER[latent])
-        return self.impedance.impedance_covariance(x1, x2, IMPEDANCE_ORDER[latent])
-
     def prior_variance(self, x: Tensor, latent: Latent) -> Tensor:
         """Prior variance of the latent, of its logarithm where warped, `(..., n)`."""
-        if latent is Latent.FORCE:
-            return self.forward(x, x, diag=True)
-        if latent is Latent.RESIDUAL_FORCE:
-            return self.residual_covariance(x, x, diag=True)
-        if latent in TRAJECTORY_ORDER:
-            return self.impedance.trajectory_variance(x, TRAJECTORY_ORDER[latent])
-        process = self.impedance.processes[IMPEDANCE_ORDER[latent]]
-        return process.gaussian_covariance(x, x, diag=True)
+        if latent in IMPEDANCE_ORDER:
+            process = self.impedance.processes[IMPEDANCE_ORDER[latent]]
+            return process.gaussian_covariance(x, x, diag=True)
+        return super().prior_variance(x, latent)
 
 
 class InteractionMean(Mean):

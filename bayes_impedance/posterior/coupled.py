@@ -234,7 +234,7 @@ class CoupledConditioner:
         prior = (shown * mean_of_one, prior_own, prior_covariance)
         if self.factor is None:
             return TermMoments(before * mean_of_one, prior_own, prior_covariance, *prior)
-        cross = self.kernel.impedance.term_covariance(self.inputs, x, order)
+        cross = self.kernel.impedance.impedance_covariance(self.inputs, x, order)
         white = self.factor.whiten(cross)
         shift = (cross.mT @ self.factor.alpha.unsqueeze(-1)).squeeze(-1).unflatten(-1, (-1, count))
         # `(groups, m, terms, n)`

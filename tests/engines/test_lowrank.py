@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from bayes_impedance.engines.given_dense import DenseGivenImpedance
-from bayes_impedance.engines.given_impedance import LATENTS, Processes
+from bayes_impedance.engines.given_impedance import LATENTS, Processes, as_read
 from bayes_impedance.engines.lowrank import Accuracy, LowRankEngine, engine, unsupported
 from bayes_impedance.engines.lowrank.blocks import LARGEST, batches
 from bayes_impedance.engines.lowrank.hilbert import CHEAP, FINE, TIGHT, Extent, counts
@@ -252,7 +252,8 @@ def test_design_matrices_are_force_and_trajectory_of_the_same_coefficients(coupl
         (Latent.DESIRED_POSITION, Latent.DESIRED_VELOCITY, Latent.DESIRED_ACCELERATION)
     ):
         known = given.impedance
-        cross = dense._cross(processes, dense._known(known), given.features, dense._known(known), latent)
+        read = as_read(known, dense.coupled)
+        cross = dense._cross(processes, read, given.features, read, latent)
         found = force @ design.trajectory(x, order).mT
         torch.testing.assert_close(found, cross, rtol=0, atol=1e-9 * cross.abs().max().item())
 

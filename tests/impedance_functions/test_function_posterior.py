@@ -91,7 +91,7 @@ def test_logarithm_is_the_gaussian_of_the_weights(overrides):
         spread += torch.diag_embed(function.left_out(problem.features.inputs, design).transpose(1, 2))
         # Of 4000 draws a variance is good to √(2/4000) = 2 %.
         torch.testing.assert_close(spread, covariance, rtol=0.15, atol=0.08 * float(covariance.max()))
-        expected = function.prior(problem.features.inputs)
+        expected = function.prior(problem.features.inputs, function.design(problem.features.inputs))
         torch.testing.assert_close((prior_location, prior_covariance), expected[2:], rtol=0, atol=0)
 
 

@@ -12,9 +12,8 @@ from torch import Tensor
 from bayes_impedance.engines.given_impedance import (
     MeanAndVariance,
     Processes,
-    diagonal_only,
+    as_read,
     mean_force,
-    sum_over_axes,
 )
 from bayes_impedance.engines.lowrank.blocks import Batch, batches
 from bayes_impedance.engines.lowrank.columns import Design
@@ -52,8 +51,10 @@ class LowRankEngine:
         """
         _, solution = self.coefficients(processes, impedance)
         # Rows were divided by σ_r, so its log det is that of every sample.
-        noise = (self._noise(processes)[..., 0].log() + math.log(2.0 * math.pi)) * self._count()
-        return -0.5 * (solution.quadratic + solution.log_det + sum_over_axes(noise, self.coupled))
+        noise = (self._noise(processes)[..., 0].log() + math.log(2.0 * math.pi)) * self.features.counts
+        if self.coupled:
+            noise = noise.sum(0, keepdim=True)
+        return -0.5 * (solution.quadratic + solution.log_det + noise)
 
     def posterior(
         self, processes: Processes, impedance: Tensor, target: Features, target_impedance: Tensor
@@ -68,7 +69,12 @@ class LowRankEngine:
             design, solution = self.coefficients(processes, impedance, target)
             sources = self._blocks(processes)
             return predict(
-                design, solution, sources, target, self._known(target_impedance), own_column(processes)
+                design,
+                solution,
+                sources,
+                target,
+                as_read(target_impedance, self.coupled),
+                own_column(processes),
             )
 
     def design(self, processes: Processes, target: Features | None = None) -> Design:
@@ -96,18 +102,10 @@ class LowRankEngine:
             NotPositiveDefiniteError: rounding leaves no Cholesky factor.
         """
         design = self.design(processes, target)
-        return design, self._solve(processes, design, self._known(impedance))
-
-    def _known(self, impedance: Tensor) -> Tensor:
-        return impedance if self.coupled else diagonal_only(impedance)
+        return design, self._solve(processes, design, as_read(impedance, self.coupled))
 
     def _noise(self, processes: Processes) -> Tensor:
         return processes.noise_variance.expand(self.features.inputs.shape[0], 1, 1)
-
-    def _count(self) -> Tensor:
-        inputs, valid = self.features.inputs, self.features.valid
-        groups, n = inputs.shape[1:3]
-        return inputs.new_full((groups,), n) if valid is None else valid.sum(-1).to(inputs)
 
     def _blocks(self, processes: Processes) -> tuple[Batch, ...]:
         column = own_column(processes)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from bayes_impedance.engines.given_impedance import LATENTS, MeanAndVariance, mean_force
+from bayes_impedance.engines.given_impedance import LATENTS, MeanAndVariance, prior_mean
 from bayes_impedance.engines.lowrank.blocks import Batch, batches
 from bayes_impedance.engines.lowrank.columns import Design
 from bayes_impedance.engines.lowrank.woodbury import Own, Solution
@@ -35,7 +35,7 @@ def predict(
         for b, label in enumerate(batch.labels)
     }
     result = {
-        latent: (_prior_mean(design, target, impedance, latent), x.new_zeros(x.shape[:-1]))
+        latent: (prior_mean(design.layout, target, impedance, latent).clone(), x.new_zeros(x.shape[:-1]))
         for latent in LATENTS
     }
     for batch in batches(target, column):
@@ -83,11 +83,3 @@ def _columns(design: Design, x: Tensor, impedance: Tensor, latent: Latent) -> tu
     if latent is Latent.RESIDUAL_FORCE:
         trajectory = torch.zeros_like(trajectory)
     return design.split(trajectory, design.residual(x))
-
-
-def _prior_mean(design: Design, target: Features, impedance: Tensor, latent: Latent) -> Tensor:
-    if latent in TRAJECTORY_ORDER:
-        return target.trajectory_mean[..., TRAJECTORY_ORDER[latent]].clone()
-    if latent is Latent.FORCE:
-        return mean_force(design.layout, target, impedance)
-    return target.inputs.new_zeros(target.inputs.shape[:-1])

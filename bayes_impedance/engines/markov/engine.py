@@ -11,15 +11,15 @@ from bayes_impedance.engines.given_impedance import (
     LATENTS,
     MeanAndVariance,
     Processes,
-    diagonal_only,
-    mean_force,
+    as_read,
+    prior_mean,
 )
 from bayes_impedance.engines.markov.arrangement import Samples, Structure, arrange
 from bayes_impedance.engines.markov.likelihood import FilterLikelihood, smoothed_states
 from bayes_impedance.engines.markov.observation import Scales, by_sample, matrices_of
 from bayes_impedance.errors import ConfigurationError
 from bayes_impedance.features import Features
-from bayes_impedance.kernels.impedance import TRAJECTORY_ORDER, Latent
+from bayes_impedance.kernels.impedance import Latent
 
 
 class MarkovEngine:
@@ -71,18 +71,14 @@ class MarkovEngine:
             matrices = matrices_of(target_impedance, samples, self.coupled)
             force = scales.force_rows(matrices, samples)
             states, covariance = self._smoothed(processes, impedance, samples)
-            known = target_impedance if self.coupled else diagonal_only(target_impedance)
+            known = as_read(target_impedance, self.coupled)
             result = {}
             for latent in LATENTS:
                 rows = scales.latent_rows(latent, force, samples, self.structure)
                 shift = (rows @ states.unsqueeze(-1))[..., 0]
                 variance = ((rows @ covariance) * rows).sum(-1).clamp_min(0.0)
                 mean, spread = (self._scattered(part, samples, target) for part in (shift, variance))
-                if latent is Latent.FORCE:
-                    mean = mean + mean_force(processes.layout, target, known)
-                elif latent in TRAJECTORY_ORDER:
-                    mean = mean + target.trajectory_mean[..., TRAJECTORY_ORDER[latent]]
-                result[latent] = (mean, spread)
+                result[latent] = (mean + prior_mean(processes.layout, target, known, latent), spread)
         return result
 
     @property
