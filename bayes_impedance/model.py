@@ -337,7 +337,9 @@ class ImpedanceModel:
         return {
             "bayes_impedance": version("bayes-impedance"),
             "torch": version("torch"),
-            "configuration": self.config.model_dump(mode="json", exclude={"training", "baseline"}),
+            "configuration": self.config.model_dump(
+                mode="json", exclude={"training", "sampling", "baseline"}
+            ),
             "recordings": log.fingerprint()[:16],
         }
 

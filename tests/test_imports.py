@@ -152,12 +152,21 @@ IMPEDANCE_FUNCTIONS = (
     "impedance_functions.log_matrix",
     "impedance_functions.inducing",
     "impedance_functions.function",
+    "impedance_functions.tilted",
     "impedance_functions.density",
     "impedance_functions.laplace",
     "impedance_functions.evidence",
     "impedance_functions.fit",
     "impedance_functions.conditioned",
     "impedance_functions",
+)
+SAMPLING = (
+    "sampling.parameters",
+    "sampling.density",
+    "sampling.start",
+    "sampling.draws",
+    "sampling.program",
+    "sampling",
 )
 #: Training and posteriors of functions give what training and posteriors of moments give.
 FITTED_FUNCTIONS = ("impedance_functions.train", "impedance_functions.posterior")
@@ -211,6 +220,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
                 "evaluation.folds",
                 *BASELINES,
             },
+            set(SAMPLING),
             {"model"},
             {"persistence", "evaluation.contenders", "sensitivity"},
             {"evaluation.held_out"},
@@ -237,6 +247,7 @@ FAMILIES = (
     IMPEDANCE_FUNCTIONS,
     POSTERIOR,
     FITTED_FUNCTIONS,
+    SAMPLING,
     BASELINES,
     SIMULATION,
     PLOTTING,

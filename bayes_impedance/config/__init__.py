@@ -1,11 +1,12 @@
 """Configuration: YAML checked by pydantic, unknown keys refused with the nearest known one.
 
 Sections follow the flow of the data: `log` → `preprocessing` → `model`, `shared` → `engine`,
-`training`, `baseline`. Every scale is in the SI unit of its quantity.
+`training`, `sampling`, `baseline`. Every scale is in the SI unit of its quantity.
 """
 
 from bayes_impedance.config.inference import BaselineConfig as BaselineConfig
 from bayes_impedance.config.inference import EngineConfig as EngineConfig
+from bayes_impedance.config.inference import SamplingConfig as SamplingConfig
 from bayes_impedance.config.inference import TrainingConfig as TrainingConfig
 from bayes_impedance.config.loading import Config as Config
 from bayes_impedance.config.loading import as_yaml as as_yaml

@@ -10,6 +10,10 @@ from bayes_impedance.config.sections import Component, Section
 
 #: Engines by name; `auto` takes the cheapest that computes the same quantity exactly.
 EngineName = Literal["auto", "dense", "markov", "lowrank"]
+#: How posteriors are drawn: exactly, in the limit, or by an approximation.
+SamplingMethod = Literal["nuts", "svi", "laplace"]
+#: Family of variational posteriors.
+Guide = Literal["multivariate_normal", "low_rank"]
 #: What becomes of stiffness, damping and mass: integrated out to second order, or estimated as functions.
 ImpedanceInference = Literal["moments", "map"]
 
@@ -46,6 +50,26 @@ class TrainingConfig(Section):
     seed: int = Field(default=0, ge=0)
     max_iterations: int = Field(default=200, ge=1)
     gradient_tolerance: float = Field(default=1e-3, gt=0)
+
+
+class SamplingConfig(Section):
+    """How posteriors of impedance and hyperparameters are drawn.
+
+    `nuts`: `chains` of `warmup` iterations and then `draws`, each step aimed at `target_acceptance`, in trees of at most
+    2^`max_tree_depth` steps. `svi`: a Gaussian `guide`, fitted in `steps`. `laplace`: the curvature at the mode. The
+    last two give `chains` times `draws` as well. Functions are kept at `places` of their input.
+    """
+
+    method: SamplingMethod = "nuts"
+    chains: int = Field(default=4, ge=1, le=64)
+    warmup: int = Field(default=500, ge=20)
+    draws: int = Field(default=500, ge=1)
+    seed: int = Field(default=0, ge=0)
+    target_acceptance: float = Field(default=0.8, ge=0.5, le=0.999)
+    max_tree_depth: int = Field(default=10, ge=1, le=15)
+    guide: Guide = "multivariate_normal"
+    steps: int = Field(default=2000, ge=1)
+    places: int = Field(default=50, ge=2, le=1000)
 
 
 class BaselineConfig(Section):

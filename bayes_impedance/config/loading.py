@@ -12,7 +12,12 @@ from typing import Any, Self, get_args
 import yaml
 from pydantic import BaseModel, ValidationError, model_validator
 
-from bayes_impedance.config.inference import BaselineConfig, EngineConfig, TrainingConfig
+from bayes_impedance.config.inference import (
+    BaselineConfig,
+    EngineConfig,
+    SamplingConfig,
+    TrainingConfig,
+)
 from bayes_impedance.config.log import LogConfig
 from bayes_impedance.config.model import DeviceConfig, ModelConfig, SharedConfig
 from bayes_impedance.config.preprocessing import PreprocessingConfig
@@ -33,6 +38,7 @@ class Config(Section):
     device: DeviceConfig | None = None
     engine: EngineConfig = EngineConfig()
     training: TrainingConfig = TrainingConfig()
+    sampling: SamplingConfig = SamplingConfig()
     baseline: BaselineConfig = BaselineConfig()
 
     @model_validator(mode="after")

@@ -35,9 +35,11 @@ class EngineChoice:
 
 
 def choose_engine(
-    config: EngineConfig, processes: Processes, features: Features, coupled: bool
+    config: EngineConfig, processes: Processes, features: Features, coupled: bool, few: int = FEW
 ) -> EngineChoice:
     """The engine asked for, or the cheapest that is exact and holds the processes: Markov, then dense, then low-rank.
+
+    Dense goes before low-rank up to `few` forces, and beyond only where features cannot hold the processes.
 
     Raises:
         ConfigurationError: the engine asked for cannot hold them, or none can.
@@ -57,13 +59,17 @@ def choose_engine(
     if not_markov is None:
         return EngineChoice("markov", "exact, at a cost that grows with the number of samples")
     size = _largest(features, coupled)
-    if size <= min(config.max_samples, FEW) and not processes.periodic:
-        return EngineChoice(
-            "dense", f"exact for any process, and {size} forces are few; not markov: {not_markov}"
-        )
+    dense_serves = size <= min(config.max_samples, FEW) and not processes.periodic
+    few_forces = EngineChoice(
+        "dense", f"exact for any process, and {size} forces are few; not markov: {not_markov}"
+    )
+    if dense_serves and size <= few:
+        return few_forces
     not_lowrank = _refusal("lowrank", processes, features, coupled)
     if not_lowrank is None:
         return EngineChoice("lowrank", f"features stand for the processes; not markov: {not_markov}")
+    if dense_serves:
+        return few_forces
     most = f"engine.max_samples = {config.max_samples}" if config.max_samples <= FEW else str(FEW)
     raise ConfigurationError(
         f"engine.name: expected processes that one of the engines holds, found {size} forces in a group, with dense "

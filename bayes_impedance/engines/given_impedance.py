@@ -20,7 +20,7 @@ from torch import Tensor
 
 from bayes_impedance.features import Features
 from bayes_impedance.kernels.impedance import TRAJECTORY_ORDER, InputLayout, Latent
-from bayes_impedance.kernels.stationary import StationaryKernel
+from bayes_impedance.kernels.stationary import Stationary
 from bayes_impedance.priors import ForceModel
 
 #: Mean and variance of a latent, `(axes, groups, m)` each.
@@ -44,8 +44,8 @@ class Processes:
     """
 
     layout: InputLayout
-    trajectory: StationaryKernel
-    residual: tuple[StationaryKernel, ...]
+    trajectory: Stationary
+    residual: tuple[Stationary, ...]
     noise_variance: Tensor
     periodic: bool = False
 
@@ -81,7 +81,7 @@ class ConditionalEngine(Protocol):
         """
 
 
-def residual_terms(kernel: Kernel | None) -> tuple[StationaryKernel, ...]:
+def residual_terms(kernel: Kernel | None) -> tuple[Stationary, ...]:
     """The independent terms of a residual's covariance."""
     if kernel is None:
         return ()

@@ -43,11 +43,12 @@ class Conditioned:
         Location `(groups, m, entries)` and covariance `(groups, m, entries, entries)`, twice.
         """
         one = self.density.functions[function]
-        design = one.design(target.inputs)
         weights = self.density.weights(torch.from_numpy(self.point))[function]
-        left_out = torch.diag_embed(one.left_out(target.inputs, design).transpose(1, 2))
+        with torch.no_grad():
+            design = one.design(target.inputs)
+            left_out = torch.diag_embed(one.left_out(target.inputs, design).transpose(1, 2))
+            _, _, prior_location, prior_covariance = one.prior(target.inputs, design)
         spread = torch.einsum("genw,gewfv,gfnv->gnef", design, self._weight_covariance(function), design)
-        _, _, prior_location, prior_covariance = one.prior(target.inputs, design)
         return one.logarithm(design, weights), spread + left_out, prior_location, prior_covariance
 
     def others(self, target: Features) -> Mapping[Latent, MeanAndVariance]:

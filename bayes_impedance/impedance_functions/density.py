@@ -15,13 +15,11 @@ from bayes_impedance.engines.given_impedance import ConditionalEngine, Processes
 from bayes_impedance.errors import NotPositiveDefiniteError
 from bayes_impedance.features import Features
 from bayes_impedance.impedance_functions.function import ImpedanceFunction
+from bayes_impedance.impedance_functions.tilted import TiltedDensity
 from bayes_impedance.priors import Entry, ForceModel
 
 Array = NDArray[np.float64]
 
-#: How far from the anchor a tilt is trusted, in unconstrained values: it fades beyond, and steps cost what a hyperprior
-#: of this SD would.
-TRUSTED = 2.0
 #: Hyperparameters of the impedance's own priors: functions carry their levels, and evidence finds the others.
 OF_IMPEDANCE = ("stiffness.", "damping.", "mass.")
 
@@ -87,7 +85,7 @@ def log_jacobian(loop: Loop, impedance: Tensor, valid: Tensor | None, coupled: b
     return (terms if valid is None else terms * valid).sum(-1)
 
 
-class Density:
+class Density(TiltedDensity):
     """Log density of weights and hyperparameters as functions of one vector.
 
     First the weights of each function, `(groups, entries, width)`, then the unconstrained values of the free
@@ -108,20 +106,16 @@ class Density:
         self.entries = beside_impedance(model)
         groups = features.inputs.shape[1]
         self.shapes = [(groups, len(f.places), f.width) for f in functions]
-        self.weight_count = sum(int(np.prod(shape)) for shape in self.shapes)
+        weight_count = sum(int(np.prod(shape)) for shape in self.shapes)
+        # All but components that the configuration fixes.
         moves = [entry.free.repeat(entry.raw.shape[0]).numpy() for entry in self.entries]
-        #: Coordinates that are learned: all but components that the configuration fixes.
-        self.free = np.concatenate([np.ones(self.weight_count, dtype=bool), *moves])
-        #: Gradient of a term by which the uncertainty of the weights enters (see `evidence.occam`), and the
-        #: hyperparameters at which it was found: it is local, so it fades away from them, and a step costs something.
-        #: Where turns have settled that cost is none.
-        self.tilt = np.zeros(len(self.free))
-        self.anchor: Array | None = None
+        super().__init__(weight_count, np.concatenate([np.ones(weight_count, dtype=bool), *moves]))
         self.renew()
 
     def renew(self) -> None:
         """Take up changed hyperparameters of the functions' priors."""
-        self.designs = Designs.at(self.functions, self.features.inputs)
+        with torch.no_grad():
+            self.designs = Designs.at(self.functions, self.features.inputs)
 
     def start(self) -> Array:
         """Weights at their prior mean, hyperparameters where the model stands."""
@@ -149,21 +143,6 @@ class Density:
         if loop is None:
             return value
         return value + log_jacobian(loop, impedance, self.features.valid, self.coupled)
-
-    def __call__(self, point: Array) -> tuple[float, Array]:
-        """`joint` with its tilt, and its gradient.
-
-        Raises:
-            NotPositiveDefiniteError: it is not finite there.
-        """
-        value, gradient = self.joint(point)
-        away = np.zeros_like(point)
-        if self.anchor is not None:
-            away[self.weight_count :] = (point - self.anchor)[self.weight_count :] / TRUSTED
-        # A linear term would drive noise without bound where weights outnumber forces.
-        bounded = np.tanh(away)
-        tilted = value + TRUSTED * float(self.tilt @ bounded) - 0.5 * float(away @ away)
-        return tilted, (gradient + self.tilt * (1.0 - bounded**2) - away / TRUSTED) * self.free
 
     def joint(self, point: Array) -> tuple[float, Array]:
         """Log density of forces, weights and hyperparameters, without constants of the priors, and its gradient.

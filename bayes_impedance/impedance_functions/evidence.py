@@ -21,6 +21,7 @@ from torch import Tensor
 from bayes_impedance.impedance_functions import laplace
 from bayes_impedance.impedance_functions.density import OF_IMPEDANCE, Density, log_hyperprior, pack, unpack
 from bayes_impedance.impedance_functions.function import ImpedanceFunction
+from bayes_impedance.impedance_functions.tilted import TiltedDensity
 from bayes_impedance.priors import Entry
 
 Array = NDArray[np.float64]
@@ -35,7 +36,7 @@ STEP = 0.1
 LARGEST_MOVE = 1.0
 
 
-def occam(density: Density, mode: Array, precision: Array) -> Array:
+def occam(density: TiltedDensity, mode: Array, precision: Array) -> Array:
     """Gradient of −½ log det H by the hyperparameters of `density`, `(size,)`, zero for the weights.
 
     ∂ log det H = tr H⁻¹ ∂H = Σ_i s_iᵀ ∂H s_i with s_i = H^{−½} q_i for orthonormal q_i, and sᵀ H s is minus the second
@@ -109,7 +110,9 @@ def update_variation(density: Density, mode: Array, precision: Array) -> tuple[A
         bounds=list(zip(start - width, start + width, strict=True)),
     )  # fmt: skip
     unpack(entries, found.x)
-    return quadratic.translated(mode), float(np.abs(_scaled_logarithms(entries) - before).max())
+    moved = quadratic.translated(mode)
+    density.renew()
+    return moved, float(np.abs(_scaled_logarithms(entries) - before).max())
 
 
 def _scaled_logarithms(entries: list[Entry]) -> Array:

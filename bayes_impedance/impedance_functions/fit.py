@@ -14,6 +14,7 @@ from bayes_impedance.errors import NotPositiveDefiniteError
 from bayes_impedance.impedance_functions import laplace
 from bayes_impedance.impedance_functions.density import Density
 from bayes_impedance.impedance_functions.evidence import log_variation_prior, occam, update_variation
+from bayes_impedance.impedance_functions.tilted import TiltedDensity
 
 Array = NDArray[np.float64]
 
@@ -57,22 +58,46 @@ def find_mode(
     Raises:
         NotPositiveDefiniteError: the likelihood is not finite somewhere on the way.
     """
-    climb = _Climb(density, gradient_tolerance, progress)
+
+    def vary(point: Array, precision: Array) -> tuple[Array, float]:
+        return update_variation(density, point, precision)
+
+    point, precision, climb = take_turns(density, start, max_iterations, gradient_tolerance, progress, vary)
+    return _mode(density, point, precision, climb)
+
+
+def take_turns(
+    density: TiltedDensity,
+    start: Array,
+    max_iterations: int,
+    gradient_tolerance: float,
+    progress: Callable[[int, float], None] | None,
+    vary: Callable[[Array, Array], tuple[Array, float]] | None = None,
+) -> tuple[Array, Array, Climb]:
+    """Hyperparameters of greatest evidence and the mode of the weights there, with the precision of both.
+
+    Mode and evidence take turns; `vary` changes what the density does not hold, and says where the mode then is and how
+    far that moved.
+
+    Raises:
+        NotPositiveDefiniteError: the likelihood is not finite somewhere on the way.
+    """
+    climb = Climb(density, gradient_tolerance, progress)
     point = climb(start, None, min(FIRST, max_iterations))
     precision = _precision(density, point)
     for _ in range(TURNS):
-        before = point[density.weight_count :]
+        before, moved = point[density.weight_count :], 0.0
         density.tilt, density.anchor = occam(density, point, precision), None
-        point, moved = update_variation(density, point, precision)
+        if vary is not None:
+            point, moved = vary(point, precision)
         density.anchor = point
-        density.renew()
         point = climb(point, laplace.covariance(precision), max_iterations)
         precision = _precision(density, point)
         if max(moved, np.max(np.abs(point[density.weight_count :] - before), initial=0.0)) < SETTLED:
             break
     else:
         climb.outcome = f"STOP: {TURNS} TURNS OF MODE AND EVIDENCE HAVE NOT SETTLED"
-    return _mode(density, point, precision, climb)
+    return point, precision, climb
 
 
 def find_weights(
@@ -86,7 +111,7 @@ def find_weights(
         NotPositiveDefiniteError: the likelihood is not finite somewhere on the way.
     """
     density.free[density.weight_count :] = False
-    climb = _Climb(density, gradient_tolerance, None)
+    climb = Climb(density, gradient_tolerance, None)
     point = start
     if scale is None:
         point = climb(start, None, min(FIRST, max_iterations))
@@ -95,7 +120,7 @@ def find_weights(
     return _mode(density, point, _precision(density, point), climb)
 
 
-def _mode(density: Density, point: Array, precision: Array, climb: _Climb) -> Mode:
+def _mode(density: Density, point: Array, precision: Array, climb: Climb) -> Mode:
     joint, _ = density.joint(point)
     count = density.weight_count
     marginal = joint - 0.5 * laplace.log_determinant(precision[:count, :count])
@@ -112,22 +137,23 @@ def _mode(density: Density, point: Array, precision: Array, climb: _Climb) -> Mo
     )
 
 
-def _precision(density: Density, point: Array) -> Array:
+def _precision(density: TiltedDensity, point: Array) -> Array:
     # Not of the tilted density: the cost of steps away from the anchor is no knowledge.
     return laplace.precision(lambda at: density.joint(at)[1], point, density.free)
 
 
-class _Climb:
+class Climb:
     """L-BFGS, in coordinates in which the curvature that is known is one."""
 
     def __init__(
-        self, density: Density, gradient_tolerance: float, progress: Callable[[int, float], None] | None
+        self, density: TiltedDensity, gradient_tolerance: float, progress: Callable[[int, float], None] | None
     ) -> None:
         self.density, self.gradient_tolerance, self.progress = density, gradient_tolerance, progress
         self.iterations = self.evaluations = 0
         self.outcome = ""
 
     def __call__(self, start: Array, scale: Array | None, max_iterations: int) -> Array:
+        """The maximum near `start`; `scale` is a covariance `(free, free)` that tells in which steps to climb."""
         places = np.flatnonzero(self.density.free)
         root: Array = np.asarray(np.eye(len(places)) if scale is None else np.linalg.cholesky(scale))
         best = -np.inf

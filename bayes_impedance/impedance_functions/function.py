@@ -19,7 +19,8 @@ from bayes_impedance.config import Config, Hyperparameter, ImpedancePrior, MassP
 from bayes_impedance.features import Features
 from bayes_impedance.impedance_functions.inducing import inducing_inputs
 from bayes_impedance.impedance_functions.symmetric import entries, exponential
-from bayes_impedance.kernels.warped import ImpedanceProcess, evaluate
+from bayes_impedance.kernels.stationary import Stationary
+from bayes_impedance.kernels.warped import evaluate
 from bayes_impedance.priors import ForceModel
 
 #: Added to the diagonal of R(Z, Z), relative to its ones.
@@ -32,12 +33,12 @@ OFF_DIAGONAL = 0.5
 class ImpedanceFunction:
     """One of K, D, M.
 
-    `location` `(entries,)` and `level_sd` `(entries,)`: prior mean and SD of the level of each entry of S at `places`;
-    `scale` `(entries,)`: SD of its variation over that of the process; `inducing` `(Z, D)`, None where the function is
-    a constant.
+    `covariance` of its variation along the input; `location` and `level_sd` `(entries,)`: prior mean and SD of the
+    level of each entry of S at `places`; `scale` `(entries,)`: SD of its variation over that of `covariance`;
+    `inducing` `(Z, D)`, None where the function is a constant.
     """
 
-    process: ImpedanceProcess
+    covariance: Stationary
     places: tuple[tuple[int, int], ...]
     location: Tensor
     level_sd: Tensor
@@ -55,31 +56,32 @@ class ImpedanceFunction:
         return 1 if self.inducing is None else 1 + len(self.inducing)
 
     def design(self, inputs: Tensor) -> Tensor:
-        """Factors of the weights of each entry at `inputs` `(axes, groups, n, D)`: `(groups, entries, n, width)`."""
+        """Factors of the weights of each entry at `inputs` `(axes, groups, n, D)`: `(groups, entries, n, width)`.
+
+        Differentiable in log-SD and length scale.
+        """
         level = self.level_sd[:, None, None].expand(*self.level_sd.shape, inputs.shape[-2], 1)
         level = level.expand(inputs.shape[1], *level.shape)
         if self.inducing is None:
             return level
-        with torch.no_grad():
-            root = torch.linalg.cholesky(self.covariance_at_inducing())
-            cross = evaluate(self.process.covariance, inputs, self.inducing)
-            variation = torch.linalg.solve_triangular(root, cross.mT, upper=False).mT
+        root = torch.linalg.cholesky(self.covariance_at_inducing())
+        cross = evaluate(self.covariance, inputs, self.inducing)
+        variation = torch.linalg.solve_triangular(root, cross.mT, upper=False).mT
         own = variation[[a for a, _ in self.places]].transpose(0, 1)
         return torch.cat([level, self.scale[:, None, None] * own], dim=-1)
 
     def covariance_at_inducing(self) -> Tensor:
         """s² R(Z, Z), `(axes, 1, Z, Z)`; differentiable in log-SD and length scale."""
         assert self.inducing is not None
-        covariance = evaluate(self.process.covariance, self.inducing, self.inducing)
-        jitter = JITTER * self.process.covariance.sd**2
+        covariance = evaluate(self.covariance, self.inducing, self.inducing)
+        jitter = JITTER * self.covariance.sd**2
         return covariance + jitter * torch.eye(len(self.inducing), dtype=covariance.dtype)
 
     def left_out(self, inputs: Tensor, design: Tensor) -> Tensor:
         """Prior variance that inducing inputs do not carry, `(groups, entries, n)`, given the `design` there."""
         if self.inducing is None:
             return inputs.new_zeros(design.shape[:-1])
-        with torch.no_grad():
-            own = evaluate(self.process.covariance, inputs, inputs, diag=True)
+        own = evaluate(self.covariance, inputs, inputs, diag=True)
         own = own.expand(inputs.shape[:-1])[[a for a, _ in self.places]].transpose(0, 1)
         carried = design[..., 1:].square().sum(-1)
         return (self.scale.square()[:, None] * own - carried).clamp_min(0.0)
@@ -124,7 +126,7 @@ def build_functions(
     places = entries(axes, config.model.axes == "coupled")
     functions = []
     for process, prior, own in zip(impedance.processes, _priors(config), inducing, strict=True):
-        functions.append(_function(process, prior, places, own))
+        functions.append(_function(process.covariance, prior, places, own))
     return tuple(functions)
 
 
@@ -133,7 +135,7 @@ def _priors(config: Config) -> tuple[ImpedancePrior | MassPrior, ...]:
 
 
 def _function(
-    process: ImpedanceProcess,
+    covariance: Stationary,
     prior: ImpedancePrior | MassPrior,
     places: Sequence[tuple[int, int]],
     inducing: Tensor | None,
@@ -149,7 +151,7 @@ def _function(
         return torch.tensor([on if a == b else off for a, b in places], dtype=torch.float64)
 
     return ImpedanceFunction(
-        process=process,
+        covariance=covariance,
         places=tuple(places),
         location=by_place(math.log(prior.level.median), 0.0),
         level_sd=by_place(level_sd, coupling),

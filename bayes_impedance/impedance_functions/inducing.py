@@ -6,14 +6,14 @@ import torch
 from torch import Tensor
 
 from bayes_impedance.features import Features
-from bayes_impedance.kernels.stationary import StationaryKernel
+from bayes_impedance.kernels.stationary import Stationary
 from bayes_impedance.kernels.warped import evaluate
 
 #: At most so many candidates among which inducing inputs of several dimensions are chosen.
 CANDIDATES = 2000
 
 
-def inducing_inputs(covariance: StationaryKernel, features: Features, count: int) -> Tensor:
+def inducing_inputs(covariance: Stationary, features: Features, count: int) -> Tensor:
     """At most `count` rows like those of `features.inputs`, `(Z, D)`, of which only the columns of ξ matter.
 
     Evenly spaced from the least to the greatest value of a scalar ξ; else samples, each the one whose function value
@@ -39,7 +39,7 @@ def _rows(features: Features) -> Tensor:
     return torch.cat(rows)
 
 
-def _least_known(covariance: StationaryKernel, rows: Tensor, count: int) -> Tensor:
+def _least_known(covariance: Stationary, rows: Tensor, count: int) -> Tensor:
     with torch.no_grad():
         prior = evaluate(covariance, rows, rows).reshape(-1, len(rows), len(rows))[0]
     remaining = prior.diagonal().clone()

@@ -198,11 +198,14 @@ def _set_levels(density: Density, mode: Mode) -> dict[str, list[list[float]]]:
     Averages of the diagonal of the logarithm, over the samples of all groups. Returns their Laplace SDs by name.
     """
     log_sd = {}
-    parts = zip(("stiffness", "damping", "mass"), density.functions, density.designs.designs, strict=True)
+    processes = density.model.kernel.impedance.processes
+    parts = zip(
+        ("stiffness", "damping", "mass"), processes, density.functions, density.designs.designs, strict=True
+    )
     entries = {entry.name: entry for entry in density.model.entries}
     share = _shares(density.features)
     start = 0
-    for name, function, design in parts:
+    for name, process, function, design in parts:
         groups, places, width = design.shape[0], design.shape[1], design.shape[3]
         count = groups * places * width
         if not entries[f"{name}.level"].specs[0].fixed:
@@ -213,8 +216,8 @@ def _set_levels(density: Density, mode: Mode) -> dict[str, list[list[float]]]:
                 own, factor = where[:, e].reshape(-1), average[:, e].reshape(-1)
                 levels.append(float(function.location[e]) + factor @ mode.point[own])
                 spreads.append([float(np.sqrt(factor @ mode.covariance[np.ix_(own, own)] @ factor))])
-            shape = function.process.raw_level.shape
-            function.process.level = torch.tensor(levels, dtype=torch.float64).exp().reshape(shape)
+            shape = process.raw_level.shape
+            process.level = torch.tensor(levels, dtype=torch.float64).exp().reshape(shape)
             log_sd[f"{name}.level"] = spreads
         start += count
     return log_sd

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bayes_impedance.kernels.stationary import (
     Profile,
-    StationaryKernel,
+    Stationary,
     half_squared_distance,
     stack_columns,
 )
@@ -46,7 +46,7 @@ Table = list[list[Any]]
 
 
 def derivative_table(
-    kernel: StationaryKernel, path1: Path, path2: Path, order: int = 2, diag: bool = False
+    kernel: Stationary, path1: Path, path2: Path, order: int = 2, diag: bool = False
 ) -> tuple[Tensor, Table]:
     """∂_tⁱ ∂_t'ʲ k = `common` · `table[i][j]` for i, j ≤ `order` ≤ 2.
 
@@ -138,7 +138,7 @@ def _table_exponential(forms: Forms, order: int) -> Table:
     return [[k00, k01, k02], [k10, k11, k12], [k20, k21, k22]]
 
 
-def _forms(kernel: StationaryKernel, path1: Path, path2: Path) -> Forms:
+def _forms(kernel: Stationary, path1: Path, path2: Path) -> Forms:
     theta1, a1, b1 = path1
     theta2, a2, b2 = path2
     p = theta1.shape[-1]
@@ -207,7 +207,7 @@ def _projections_exact(
     return s, from_left(a1w), from_right(a2w), beta1, beta2
 
 
-def _forms_diagonal(kernel: StationaryKernel, path1: Path, path2: Path) -> Forms:
+def _forms_diagonal(kernel: Stationary, path1: Path, path2: Path) -> Forms:
     """The forms at θ = θ' sample by sample, `(..., n)`: r = 0, so α = β = 0."""
     _, a1, b1 = path1
     _, a2, b2 = path2

@@ -10,6 +10,7 @@ import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
@@ -280,14 +281,56 @@ class StationaryKernel(BatchedKernel):
 
     def forward(self, x1: Tensor, x2: Tensor, diag: bool = False, **params: object) -> Tensor:
         """σ² κ(s), `(..., n1, n2)`, or `(..., n)` with `diag`."""
-        variance = self.sd**2
-        if diag:
-            return variance[..., 0].expand(torch.broadcast_shapes(x1.shape[:-1], (*variance.shape[:-2], 1)))
-        if not self.has_lengthscale:
-            rows = torch.broadcast_shapes(x1.shape[:-2], x2.shape[:-2], variance.shape[:-2])
-            return variance.expand(*rows, x1.shape[-2], x2.shape[-2])
-        s = half_squared_distance(x1, x2, self.precision, self.profile.exact_distance)
-        return variance * self.profile.value(s, self.shape)
+        return _covariance(self, x1, x2, diag)
+
+
+@dataclass(frozen=True)
+class StationaryCovariance:
+    """What a `StationaryKernel` computes, with hyperparameters that are plain tensors of anybody's own.
+
+    `sd`, `lengthscale`, `shape` as those of the kernel; `active_dims` `(p,)`, None for all columns. For inference that
+    evaluates a covariance at thousands of hyperparameters: gradients reach wherever these came from, and no module is
+    copied or changed.
+    """
+
+    profile: Profile
+    num_dims: int
+    active_dims: Tensor | None
+    sd: Tensor
+    lengthscale: Tensor
+    shape: Tensor | None = None
+
+    @classmethod
+    def like(
+        cls, kernel: Stationary, sd: Tensor, lengthscale: Tensor | None, shape: Tensor | None = None
+    ) -> Self:
+        """Profile and inputs of `kernel` with other hyperparameters; a constant has no `lengthscale`."""
+        lengthscale = sd[..., :0] if lengthscale is None else lengthscale
+        return cls(kernel.profile, kernel.num_dims, kernel.active_dims, sd, lengthscale, shape)
+
+    @property
+    def precision(self) -> Tensor:
+        """Diagonal of P = 1/ℓ², `(*batch, 1, p)`."""
+        return self.lengthscale**-2
+
+    def forward(self, x1: Tensor, x2: Tensor, diag: bool = False) -> Tensor:
+        """σ² κ(s), `(..., n1, n2)`, or `(..., n)` with `diag`."""
+        return _covariance(self, x1, x2, diag)
+
+
+#: A stationary covariance, as a gpytorch kernel or of plain tensors.
+Stationary = StationaryKernel | StationaryCovariance
+
+
+def _covariance(kernel: Stationary, x1: Tensor, x2: Tensor, diag: bool) -> Tensor:
+    variance = kernel.sd**2
+    if diag:
+        return variance[..., 0].expand(torch.broadcast_shapes(x1.shape[:-1], (*variance.shape[:-2], 1)))
+    if kernel.num_dims == 0:
+        rows = torch.broadcast_shapes(x1.shape[:-2], x2.shape[:-2], variance.shape[:-2])
+        return variance.expand(*rows, x1.shape[-2], x2.shape[-2])
+    s = half_squared_distance(x1, x2, kernel.precision, kernel.profile.exact_distance)
+    return variance * kernel.profile.value(s, kernel.shape)
 
 
 def half_squared_distance(x1: Tensor, x2: Tensor, precision: Tensor, exact: bool) -> Tensor:

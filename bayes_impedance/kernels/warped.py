@@ -15,7 +15,12 @@ from gpytorch.priors import Prior
 from linear_operator import to_dense
 from torch import Tensor
 
-from bayes_impedance.kernels.stationary import BatchedKernel, register_positive, set_positive
+from bayes_impedance.kernels.stationary import (
+    BatchedKernel,
+    StationaryCovariance,
+    register_positive,
+    set_positive,
+)
 
 #: Whether w itself is a Gaussian process, or its logarithm.
 Law = Literal["gaussian", "log_gaussian"]
@@ -97,8 +102,9 @@ class ImpedanceProcess(BatchedKernel):
         return self.moments(x1, x2)[2]
 
 
-def evaluate(kernel: Kernel, x1: Tensor, x2: Tensor, diag: bool = False) -> Tensor:
+def evaluate(kernel: Kernel | StationaryCovariance, x1: Tensor, x2: Tensor, diag: bool = False) -> Tensor:
     """Dense covariance of any gpytorch kernel, without the cost of its lazy tensors."""
     if kernel.active_dims is not None:
         x1, x2 = x1.index_select(-1, kernel.active_dims), x2.index_select(-1, kernel.active_dims)
-    return to_dense(kernel.forward(x1, x2, diag=diag))
+    values = kernel.forward(x1, x2, diag=diag)
+    return values if isinstance(values, Tensor) else to_dense(values)

@@ -9,7 +9,8 @@ import torch
 from bayes_impedance.device import Loop
 from bayes_impedance.engines.closed_loop import jacobian
 from bayes_impedance.errors import NotPositiveDefiniteError
-from bayes_impedance.impedance_functions.density import TRUSTED, beside_impedance, log_jacobian
+from bayes_impedance.impedance_functions.density import beside_impedance, log_jacobian
+from bayes_impedance.impedance_functions.tilted import TRUSTED
 from tests.impedance_functions.problems import COUPLED, DEVICE, MARKOV, density_of, small_problem, somewhere
 
 SETTINGS = [

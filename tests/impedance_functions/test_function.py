@@ -29,7 +29,7 @@ def exact_covariance(problem, function, entry):
     prior = problem.config.model.stiffness
     x = problem.features.inputs
     with torch.no_grad():
-        own = evaluate(function.process.covariance, x, x)[a]
+        own = evaluate(function.covariance, x, x)[a]
     if a == b:
         return (0.0 if prior.level.fixed else prior.level.log_sd**2) + own
     return prior.coupling.median**2 + OFF_DIAGONAL * own

@@ -195,7 +195,7 @@ def _roots(function):
 def log_evidence(problem, log_sd, length_scale):
     """log p(y) with the kernel written out, and its hyperpriors, of axes that vary alike."""
     function = problem.density.functions[0]
-    (column,) = function.process.covariance.active_dims.tolist()
+    (column,) = function.covariance.active_dims.tolist()
     z = function.inducing[:, column].numpy()
     blocks = []
     for e, (a, b) in enumerate(function.places):
@@ -268,7 +268,7 @@ def test_hyperprior_of_coupled_axes_counts_once():
     for overrides, times in (((), 2), ((COUPLED,), 1)):
         density = density_of(small_problem(*VARYING, *overrides))
         with torch.no_grad():
-            density.functions[0].process.covariance.sd = 0.4
+            density.functions[0].covariance.sd = 0.4
         expected = times * -0.5 * (np.log(2.0) / 0.5) ** 2
         assert float(log_variation_prior(density).detach()) == pytest.approx(expected, rel=1e-12)
         stated = sum(float(log_hyperprior(entry).detach()) for entry in variation_entries(density))

@@ -21,7 +21,7 @@ from bayes_impedance.engines.lowrank.hilbert import (
 from bayes_impedance.engines.lowrank.periodic import fourier_basis
 from bayes_impedance.features import Features
 from bayes_impedance.kernels.impedance import InputLayout
-from bayes_impedance.kernels.stationary import StationaryKernel
+from bayes_impedance.kernels.stationary import Stationary
 
 
 @dataclass(frozen=True)
@@ -114,13 +114,13 @@ class Design:
         return _flatten(torch.einsum("agnm,ac->gancm", values, eye))
 
 
-def columns_of(term: StationaryKernel) -> tuple[int, ...]:
+def columns_of(term: Stationary) -> tuple[int, ...]:
     """Columns of the input that a residual term reads."""
     return tuple(range(term.num_dims)) if term.active_dims is None else tuple(term.active_dims.tolist())
 
 
 def _hilbert(
-    kernel: StationaryKernel, columns: Sequence[int], logs: Sequence[Features], accuracy: Accuracy
+    kernel: Stationary, columns: Sequence[int], logs: Sequence[Features], accuracy: Accuracy
 ) -> Basis:
     extents = [Extent.of(logs, column) for column in columns]
     return hilbert_basis(kernel, columns, extents, logs[0].inputs.shape[0], accuracy)

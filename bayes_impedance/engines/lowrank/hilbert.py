@@ -17,7 +17,7 @@ from torch import Tensor
 
 from bayes_impedance.engines.lowrank.basis import Basis, Waves
 from bayes_impedance.features import Features
-from bayes_impedance.kernels.stationary import StationaryKernel
+from bayes_impedance.kernels.stationary import Stationary
 
 #: Beyond so many times the cutoff a product of waves is left out; measured: within twice the error of all products.
 RADIUS = 1.1
@@ -76,12 +76,12 @@ class Extent:
         return cls(0.5 * (low + high), 0.5 * (high - low))
 
 
-def length_scales(kernel: StationaryKernel, axes: int) -> Tensor:
+def length_scales(kernel: Stationary, axes: int) -> Tensor:
     """ℓ of every component, `(axes, 1, 1, p)`."""
     return kernel.lengthscale.expand(axes, 1, 1, kernel.num_dims)
 
 
-def counts(kernel: StationaryKernel, extents: Sequence[Extent], axes: int, accuracy: Accuracy) -> list[int]:
+def counts(kernel: Stationary, extents: Sequence[Extent], axes: int, accuracy: Accuracy) -> list[int]:
     """Waves that each component of θ needs: ⌈2 L · cutoff / (π ℓ)⌉ of the axis that needs most."""
     scales = length_scales(kernel, axes).detach()
     needed = []
@@ -92,9 +92,7 @@ def counts(kernel: StationaryKernel, extents: Sequence[Extent], axes: int, accur
     return needed
 
 
-def products(
-    kernel: StationaryKernel, extents: Sequence[Extent], axes: int, accuracy: Accuracy
-) -> Tensor | None:
+def products(kernel: Stationary, extents: Sequence[Extent], axes: int, accuracy: Accuracy) -> Tensor | None:
     """Products of waves that matter, Σ_d (ω_d ℓ_d)² within the cutoff, `(features, p)`; None for a scalar θ."""
     needed = counts(kernel, extents, axes, accuracy)
     if len(needed) == 1:
@@ -108,7 +106,7 @@ def products(
 
 
 def hilbert_basis(
-    kernel: StationaryKernel,
+    kernel: Stationary,
     columns: Sequence[int],
     extents: Sequence[Extent],
     axes: int,
@@ -133,7 +131,7 @@ def hilbert_basis(
     return Basis(tuple(columns), tuple(waves), products(kernel, extents, axes, accuracy))
 
 
-def constant_basis(kernel: StationaryKernel, axes: int) -> Basis:
+def constant_basis(kernel: Stationary, axes: int) -> Basis:
     """The one feature σ of a constant: a wave of frequency 0."""
     zero = kernel.sd.new_zeros(1, 1, 1, 1)
     return Basis((0,), (Waves(zero, zero + 0.5 * math.pi, kernel.sd.expand(axes, 1, 1, 1)),))

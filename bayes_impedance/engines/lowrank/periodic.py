@@ -16,16 +16,16 @@ import torch
 
 from bayes_impedance.engines.lowrank.basis import Basis, Waves
 from bayes_impedance.engines.lowrank.hilbert import Accuracy, length_scales
-from bayes_impedance.kernels.stationary import StationaryKernel
+from bayes_impedance.kernels.stationary import Stationary
 
 
-def harmonics(kernel: StationaryKernel, axes: int, accuracy: Accuracy) -> int:
+def harmonics(kernel: Stationary, axes: int, accuracy: Accuracy) -> int:
     """J = ⌈cutoff / (2πℓ)⌉ of the axis that needs most."""
     shortest = length_scales(kernel, axes).detach().min().item()
     return math.ceil(accuracy.cutoff / (2.0 * math.pi * shortest))
 
 
-def fourier_basis(kernel: StationaryKernel, column: int, axes: int, accuracy: Accuracy) -> Basis:
+def fourier_basis(kernel: Stationary, column: int, axes: int, accuracy: Accuracy) -> Basis:
     """The 2J + 1 features √S(0), √(2 S(2πj)) cos(2πjθ), √(2 S(2πj)) sin(2πjθ) of the phase in `column`."""
     count = harmonics(kernel, axes, accuracy)
     scale = length_scales(kernel, axes)

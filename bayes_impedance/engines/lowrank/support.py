@@ -12,7 +12,7 @@ from bayes_impedance.engines.lowrank.columns import columns_of
 from bayes_impedance.engines.lowrank.hilbert import Accuracy, Extent, chosen, counts, products
 from bayes_impedance.engines.lowrank.periodic import harmonics
 from bayes_impedance.features import Features
-from bayes_impedance.kernels.stationary import PROFILES, Profile, SquaredExponential, StationaryKernel
+from bayes_impedance.kernels.stationary import PROFILES, Profile, SquaredExponential, Stationary
 
 #: Features of one regression: its factor then takes 32 MB, and half a second.
 MAX_FEATURES = 2000
@@ -67,7 +67,7 @@ def _trajectory_kind(processes: Processes) -> str | None:
 
 def _residual_kind(processes: Processes) -> str | None:
     for term in processes.residual:
-        if not isinstance(term, StationaryKernel):
+        if not isinstance(term, Stationary):
             return (
                 f"expected a residual force of stationary kernels, got {type(term).__name__}; take "
                 "model.residual.kernel=squared_exponential, or engine.name=dense"
@@ -125,9 +125,7 @@ def _number(
     )
 
 
-def _size(
-    kernel: StationaryKernel, columns: Sequence[int], logs: Sequence[Features], accuracy: Accuracy
-) -> int:
+def _size(kernel: Stationary, columns: Sequence[int], logs: Sequence[Features], accuracy: Accuracy) -> int:
     if not kernel.num_dims:
         return 1
     extents = [Extent.of(logs, column) for column in columns]

@@ -16,7 +16,7 @@ from bayes_impedance.engines.markov.state_space import RATE
 from bayes_impedance.errors import ConfigurationError
 from bayes_impedance.features import Features
 from bayes_impedance.kernels.impedance import InputLayout
-from bayes_impedance.kernels.stationary import Matern, StationaryKernel
+from bayes_impedance.kernels.stationary import Matern, Stationary
 
 #: Most states that one filter may hold: its time grows with their square.
 LARGEST_STATE = 128
@@ -188,7 +188,7 @@ def arrange(samples: Samples, structure: Structure, axes: int) -> Sequences:
     return Sequences(order, samples.group[order][starts], torch.from_numpy(np.stack(columns, axis=-1)), plan)
 
 
-def _states(kernel: StationaryKernel) -> int:
+def _states(kernel: Stationary) -> int:
     """Number of states; 0 where there is no finite one, or more than three."""
     if kernel.num_dims == 0:
         return 1
@@ -197,12 +197,12 @@ def _states(kernel: StationaryKernel) -> int:
     return size if size in RATE else 0
 
 
-def _name(kernel: StationaryKernel) -> str:
+def _name(kernel: Stationary) -> str:
     profile = kernel.profile
     return f"Matérn, nu = {profile.nu:g}" if isinstance(profile, Matern) else type(profile).__name__
 
 
-def _term(kernel: StationaryKernel) -> Term:
+def _term(kernel: Stationary) -> Term:
     if kernel.num_dims == 0:
         return Term(1, None)
     size = _states(kernel)

@@ -17,7 +17,7 @@ from bayes_impedance.engines.given_impedance import Processes
 from bayes_impedance.engines.markov.arrangement import Samples, Structure
 from bayes_impedance.engines.markov.state_space import RATE
 from bayes_impedance.kernels.impedance import TRAJECTORY_ORDER, Latent
-from bayes_impedance.kernels.stationary import StationaryKernel
+from bayes_impedance.kernels.stationary import Stationary
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def by_sample(values: Tensor, samples: Samples) -> Tensor:
     return values[:, torch.from_numpy(samples.group), torch.from_numpy(samples.row)].transpose(0, 1)
 
 
-def _rate(kernel: StationaryKernel, size: int, axes: int) -> Tensor:
+def _rate(kernel: Stationary, size: int, axes: int) -> Tensor:
     return RATE[size] / _by_axis(kernel.lengthscale, axes)
 
 

@@ -1,0 +1,1 @@
+"""Posteriors drawn by Pyro: impedance, hyperparameters and, given those, desired trajectory and force."""

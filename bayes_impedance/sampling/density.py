@@ -1,0 +1,194 @@
+"""The posterior density that is sampled: impedance and hyperparameters, all else marginalised exactly.
+
+    log p(z | u) = log p(u | W(z), h(z)) + log |det(I + Z M_r⁻¹)| − ½ |z|² + const
+
+z are standard normal coordinates of every weight and hyperparameter; desired trajectory and residual force are
+integrated out by an engine given impedance (docs/model.md §13), the determinant is that of a closed loop (§6).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from bayes_impedance.config import Config
+from bayes_impedance.engines.choice import EngineChoice, build_engine, choose_engine
+from bayes_impedance.engines.given_impedance import Processes
+from bayes_impedance.errors import ConfigurationError, NotPositiveDefiniteError
+from bayes_impedance.features import Features
+from bayes_impedance.impedance_functions.density import Designs, log_jacobian
+from bayes_impedance.impedance_functions.function import ImpedanceFunction, build_functions
+from bayes_impedance.impedance_functions.tilted import TiltedDensity
+from bayes_impedance.kernels.stationary import Stationary, StationaryCovariance
+from bayes_impedance.priors import Entry, ForceModel
+from bayes_impedance.sampling.parameters import (
+    QUANTITIES,
+    Parameter,
+    filled,
+    hyperparameters_of,
+    parameter_of,
+    weights_of,
+)
+
+Array = NDArray[np.float64]
+
+#: Forces up to which dense is taken unasked: features of a few dozen columns are quicker beyond.
+FEW = 50
+
+
+class JointDensity(TiltedDensity):
+    """Log density of weights and hyperparameters given the forces of `features`.
+
+    `parameters` in the order of their coordinates; `engine_choice` says which engine marginalises, and why.
+
+    Raises:
+        ConfigurationError: no engine holds the processes.
+        TooManySamplesError: dense is asked for, and the samples are too many.
+    """
+
+    def __init__(
+        self, config: Config, model: ForceModel, features: Features, inducing: tuple[Tensor | None, ...]
+    ) -> None:
+        self.config, self.features = config, features
+        self.coupled = config.model.axes == "coupled"
+        self._model = model
+        self._functions = build_functions(config, model, inducing)
+        self._entries = {entry.name: entry for entry in model.entries}
+        # Components that nothing learns stay where the hyperprior has its median.
+        self._learned: tuple[Entry, ...] = tuple(hyperparameters_of(model, self._functions))
+        self.parameters: tuple[Parameter, ...] = (
+            *weights_of(self._functions, len(features.groups)),
+            *(parameter_of(entry, self.coupled) for entry in self._learned),
+        )
+        sizes = [parameter.size for parameter in self.parameters]
+        super().__init__(sum(sizes[: len(QUANTITIES)]), np.ones(sum(sizes), dtype=bool))
+        self._sizes = sizes
+        medians = {p.name: p.median.expand(p.shape) for p in self.parameters if p.median is not None}
+        with torch.no_grad():
+            processes = self.processes(medians)
+            self._fixed = tuple(
+                None if self._varies(name) else function.design(features.inputs)
+                for name, function in zip(QUANTITIES, self._functions, strict=True)
+            )
+        self.engine_choice: EngineChoice = choose_engine(
+            config.engine, processes, features, self.coupled, FEW
+        )
+        self.engine = build_engine(self.engine_choice.name, config.engine, processes, features, self.coupled)
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return len(self.free)
+
+    def values(self, standard: Tensor) -> dict[str, Tensor]:
+        """Values of all sites at coordinates `(..., size)`, by name."""
+        parts = standard.split(self._sizes, dim=-1)
+        return {p.name: p.value(part) for p, part in zip(self.parameters, parts, strict=True)}
+
+    def standard(self, values: Mapping[str, Tensor]) -> Tensor:
+        """The inverse of `values`."""
+        return torch.cat([p.standard(values[p.name]) for p in self.parameters], dim=-1)
+
+    def processes(self, values: Mapping[str, Tensor]) -> Processes:
+        """Desired trajectory, residual force and noise at the values of their sites."""
+        known = Processes.of(self._model, self.config.model.desired_trajectory.periodic)
+        noise = filled(self._entries["noise_sd"], values)[:, 0].square()
+        terms = [
+            self._covariance(name, term, values)
+            for name, term in zip(("residual", "residual.offset_sd"), known.residual, strict=False)
+        ]
+        trajectory = self._covariance("desired_trajectory", known.trajectory, values)
+        return replace(known, trajectory=trajectory, residual=tuple(terms), noise_variance=noise)
+
+    def functions(self, values: Mapping[str, Tensor]) -> tuple[ImpedanceFunction, ...]:
+        """K, D and M as functions, at the log-SDs and length scales among the values."""
+        return tuple(
+            replace(function, covariance=self._covariance(name, function.covariance, values, scale="log_sd"))
+            if self._varies(name)
+            else function
+            for name, function in zip(QUANTITIES, self._functions, strict=True)
+        )
+
+    def designs(self, values: Mapping[str, Tensor]) -> Designs:
+        """Designs of K, D and M at the samples whose forces are given."""
+        functions = self.functions(values)
+        parts = zip(functions, self._fixed, strict=True)
+        return Designs(
+            functions,
+            tuple(
+                function.design(self.features.inputs) if fixed is None else fixed for function, fixed in parts
+            ),
+        )
+
+    def impedance(self, values: Mapping[str, Tensor]) -> Tensor:
+        """K [N/m], D [Ns/m], M [kg] at the samples whose forces are given, `(groups, n, 3, axes, axes)`."""
+        return self.designs(values).matrices(weights(values))
+
+    def log_likelihood(self, values: Mapping[str, Tensor]) -> Tensor:
+        """log p(u | values) of all axes and groups, with the Jacobian of the closed loop [nats].
+
+        Raises:
+            NotPositiveDefiniteError: rounding left no positive variance of the forces, or length scales are so short
+                that no feature reaches them.
+        """
+        impedance = self.impedance(values)
+        try:
+            value = self.engine.log_likelihood_given_impedance(self.processes(values), impedance).sum()
+        except ConfigurationError as error:
+            # The processes were accepted at the medians: only the number of features can have grown.
+            raise NotPositiveDefiniteError(str(error)) from error
+        loop = self.features.loop
+        if loop is None:
+            return value
+        return value + log_jacobian(loop, impedance, self.features.valid, self.coupled).sum()
+
+    def log_density(self, standard: Tensor) -> Tensor:
+        """log p(z | u) up to a constant, at z `(size,)` [nats].
+
+        Raises:
+            NotPositiveDefiniteError: see `log_likelihood`.
+        """
+        return self.log_likelihood(self.values(standard)) - 0.5 * standard.square().sum()
+
+    def joint(self, point: Array) -> tuple[float, Array]:
+        """`log_density` and its gradient.
+
+        Raises:
+            NotPositiveDefiniteError: it is not finite there.
+        """
+        standard = torch.from_numpy(point).clone().requires_grad_()
+        value = self.log_density(standard)
+        (gradient,) = torch.autograd.grad(value, standard)
+        if not (bool(value.isfinite()) and bool(gradient.isfinite().all())):
+            raise NotPositiveDefiniteError(
+                "expected a finite posterior density, found one that overflows, or its gradient does; check log.units, "
+                "and that the medians under model are of the size that their unit lets expect"
+            )
+        return float(value.detach()), gradient.numpy()
+
+    def _varies(self, quantity: str) -> bool:
+        """Whether how a function varies is sampled, too."""
+        return any(entry.name.startswith(f"{quantity}.") for entry in self._learned)
+
+    def _covariance(
+        self, name: str, kernel: Stationary, values: Mapping[str, Tensor], scale: str = "sd"
+    ) -> StationaryCovariance:
+        """A covariance of the model at the values of its sites."""
+        if name.endswith("offset_sd"):
+            return StationaryCovariance.like(kernel, filled(self._entries[name], values), None)
+        parts = {
+            key: filled(entry, values)
+            for key in (scale, "length_scale", "shape")
+            if (entry := self._entries.get(f"{name}.{key}")) is not None
+        }
+        return StationaryCovariance.like(kernel, parts[scale], parts.get("length_scale"), parts.get("shape"))
+
+
+def weights(values: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
+    """Weights of K, D and M among the values of all sites."""
+    return tuple(values[f"{name}_weights"] for name in QUANTITIES)

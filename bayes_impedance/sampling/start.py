@@ -1,0 +1,56 @@
+"""Where samplers begin: the mode of greatest evidence, and the curvature about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayes_impedance.config import TrainingConfig
+from bayes_impedance.impedance_functions import laplace
+from bayes_impedance.impedance_functions.fit import take_turns
+from bayes_impedance.sampling.density import JointDensity
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Start:
+    """Laplace's approximation N(`point`, `root` `root`ᵀ) of a density over its coordinates `(size,)`.
+
+    `outcome` is that of the climb.
+    """
+
+    point: Array
+    root: Array
+    outcome: str
+
+    def at(self, steps: Array) -> Array:
+        """Coordinates of `steps` `(..., size)` in units of the approximation's SD."""
+        return self.point + steps @ self.root.T
+
+
+def find_start(
+    density: JointDensity,
+    training: TrainingConfig,
+    near: Array | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> Start:
+    """Climb from `near`, or from the prior mean.
+
+    A joint mode of functions and noise takes the noise for less than it is; so hyperparameters maximise the evidence
+    (docs/model.md §15), about which the posterior lies.
+
+    Raises:
+        NotPositiveDefiniteError: the density is not finite somewhere on the way.
+    """
+    begin = np.zeros(density.size) if near is None else near
+    point, precision, climb = take_turns(
+        density, begin, training.max_iterations, training.gradient_tolerance, progress
+    )
+    # No direction is known less than before any force.
+    values, vectors = np.linalg.eigh(laplace.covariance(precision))
+    root = vectors * np.sqrt(np.clip(values, 1e-12, 1.0))
+    return Start(point, root, climb.outcome)
