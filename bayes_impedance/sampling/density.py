@@ -114,20 +114,21 @@ class JointDensity(TiltedDensity):
             for name, function in zip(QUANTITIES, self._functions, strict=True)
         )
 
-    def designs(self, values: Mapping[str, Tensor]) -> Designs:
-        """Designs of K, D and M at the samples whose forces are given."""
+    def designs(self, values: Mapping[str, Tensor], target: Features | None = None) -> Designs:
+        """Designs of K, D and M at the samples whose forces are given, or at those of `target`."""
         functions = self.functions(values)
+        if target is not None:
+            return Designs.at(functions, target.inputs)
         parts = zip(functions, self._fixed, strict=True)
-        return Designs(
-            functions,
-            tuple(
-                function.design(self.features.inputs) if fixed is None else fixed for function, fixed in parts
-            ),
-        )
+        inputs = self.features.inputs
+        return Designs(functions, tuple(f.design(inputs) if known is None else known for f, known in parts))
 
-    def impedance(self, values: Mapping[str, Tensor]) -> Tensor:
-        """K [N/m], D [Ns/m], M [kg] at the samples whose forces are given, `(groups, n, 3, axes, axes)`."""
-        return self.designs(values).matrices(weights(values))
+    def impedance(self, values: Mapping[str, Tensor], target: Features | None = None) -> Tensor:
+        """K [N/m], D [Ns/m], M [kg] at the samples whose forces are given, or at those of `target`.
+
+        `(groups, n, 3, axes, axes)`; what inducing inputs leave out of functions is left out here, too.
+        """
+        return self.designs(values, target).matrices(weights(values))
 
     def log_likelihood(self, values: Mapping[str, Tensor]) -> Tensor:
         """log p(u | values) of all axes and groups, with the Jacobian of the closed loop [nats].
@@ -154,6 +155,10 @@ class JointDensity(TiltedDensity):
             NotPositiveDefiniteError: see `log_likelihood`.
         """
         return self.log_likelihood(self.values(standard)) - 0.5 * standard.square().sum()
+
+    def is_constant(self, quantity: int) -> bool:
+        """Whether K, D or M (0, 1, 2) does not depend on an input."""
+        return self._functions[quantity].inducing is None
 
     def joint(self, point: Array) -> tuple[float, Array]:
         """`log_density` and its gradient.
