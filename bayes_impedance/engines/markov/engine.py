@@ -106,7 +106,9 @@ class MarkovEngine:
             samples = joined.samples
             matrices = matrices_of(target_impedance, samples, self.coupled)
             force = scales.force_rows(matrices, samples)
-            states, covariance = self._smoothed(scales, joined, *self._observed(scales, impedance))
+            states, covariance = self._smoothed(
+                scales, joined, self._observed(scales, impedance), spread=True
+            )
             known = as_read(target_impedance, self.coupled)
             result = {}
             for latent in LATENTS:
@@ -140,7 +142,7 @@ class MarkovEngine:
             force = force + self._product(matrices_of(impedance, self.samples, self.coupled), deviation)
             noise = torch.randn(force.shape, generator=generator, dtype=force.dtype)
             y = y - scales.by_filter(force + scales.noise.sqrt() * noise)
-            shift, _ = self._smoothed(scales, joined, h, c, y, r)
+            shift, _ = self._smoothed(scales, joined, (h, c, y, r), spread=False)
             drawn = there + scales.by_axis(shift, self.structure)
             deviation, residual = scales.latents(drawn, joined.samples, self.structure)
             result = deviation.new_zeros(*target.inputs.shape[:3], 4)
@@ -176,9 +178,13 @@ class MarkovEngine:
         return self._last
 
     def _smoothed(
-        self, scales: Scales, joined: Joined, h: Tensor, c: Tensor, y: Tensor, r: Tensor
+        self, scales: Scales, joined: Joined, given: tuple[Tensor, Tensor, Tensor, Tensor], spread: bool
     ) -> tuple[Tensor, Tensor]:
-        """Mean `(filters, m, states)` and covariance of the states that the target's samples see."""
+        """Mean `(filters, m, states)` of the states that the target's samples see and, with `spread`, covariance.
+
+        `given` are h, c, y and r of the engine's samples.
+        """
+        h, c, y, r = given
         order = torch.from_numpy(joined.sequences.order)
         h, y = (
             torch.cat([part, part.new_zeros(len(part), len(joined.samples.group), *part.shape[2:])], dim=1)[
@@ -187,7 +193,7 @@ class MarkovEngine:
             for part in (h, y)
         )
         z = scales.steps(joined.sequences.steps)
-        return smoothed_states([z, h, c, y, r], joined.sequences, joined.rows)
+        return smoothed_states([z, h, c, y, r], joined.sequences, joined.rows, spread)
 
     def _scattered(self, values: Tensor, samples: Samples, target: Features) -> Tensor:
         """`(filters, m, axes)` as `(axes, groups, rows)`."""
