@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pyro.infer import SVI, Trace_ELBO
 from pyro.infer.autoguide import AutoContinuous, AutoLowRankMultivariateNormal, AutoMultivariateNormal
 from pyro.infer.autoguide.initialization import init_to_value
-from pyro.optim import ClippedAdam  # type: ignore[attr-defined] # made at import
+from pyro.optim import ClippedAdam
 from torch import Tensor
 
 from bayes_impedance.config import SamplingConfig
@@ -29,7 +29,7 @@ from bayes_impedance.sampling.start import Start
 Array = NDArray[np.float64]
 
 #: First rate of Adam, in SDs of Laplace's approximation, and the share of it at the last step.
-RATE, LAST = 0.02, 0.02
+RATE, LAST = 0.01, 0.02
 #: Columns of a low-rank guide begin this small, next to a diagonal of one: at zero their gradient is, too.
 SMALL = 0.1
 #: A rise of the ELBO that is too small to count [nats], and that its own noise explains, in standard errors.
@@ -69,7 +69,7 @@ def svi_draws(
 def fit_guide(
     density: JointDensity, start: Start, settings: SamplingConfig, progress: Progress | None = None
 ) -> Fitted:
-    """Maximise the ELBO over Gaussians, from Laplace's approximation `start` on, in coordinates in which that is N(0, I).
+    """Maximise the ELBO over Gaussians from Laplace's approximation `start` on, in coordinates where that is N(0, I).
 
     Adam at a rate that falls geometrically. Steps at whose draw the density or its gradient is not finite change
     nothing. Neither Pyro's parameters nor the state of torch's generator are touched.
@@ -101,7 +101,7 @@ def fit_guide(
 
 
 @contextlib.contextmanager
-def _apart(seed: int):  # type: ignore[no-untyped-def]
+def _apart(seed: int) -> Iterator[None]:
     """Parameters and random numbers of one's own."""
     with torch.random.fork_rng(devices=[]), pyro.get_param_store().scope():
         torch.manual_seed(seed)
@@ -132,7 +132,9 @@ def _moments(guide: AutoContinuous) -> tuple[Array, Array]:
 def _line(elbo: Array) -> str:
     recent = elbo[-REPORTED:]
     recent = recent[np.isfinite(recent)]
-    return f"ELBO {recent.mean():.2f}" if len(recent) else "the density is not finite at any draw of the guide"
+    return (
+        f"ELBO {recent.mean():.2f}" if len(recent) else "the density is not finite at any draw of the guide"
+    )
 
 
 def _failures(elbo: Array) -> str | None:
@@ -150,9 +152,7 @@ def _unsettled(elbo: Array) -> str | None:
     quarter = len(elbo) // 4
     before, last = (part[np.isfinite(part)] for part in (elbo[-2 * quarter : -quarter], elbo[-quarter:]))
     if quarter < 2 or min(len(before), len(last)) < 2:
-        return (
-            f"too few steps of the fit ({len(elbo)}) to say whether it has settled; set sampling.steps to 1000 or more"
-        )
+        return f"too few steps of the fit ({len(elbo)}) to say whether it has settled; set sampling.steps to 1000 or more"
     rise = float(last.mean() - before.mean())
     error = float(np.sqrt(before.var(ddof=1) / len(before) + last.var(ddof=1) / len(last)))
     if rise <= max(RISE, ERRORS * error):
