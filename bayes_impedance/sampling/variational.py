@@ -29,11 +29,12 @@ from bayes_impedance.sampling.start import Start
 Array = NDArray[np.float64]
 
 #: First rate of Adam, in SDs of Laplace's approximation, and the share of it at the last step.
-RATE, LAST = 0.01, 0.02
+RATE, LAST = 0.03, 0.02
 #: Columns of a low-rank guide begin this small, next to a diagonal of one: at zero their gradient is, too.
 SMALL = 0.1
-#: A rise of the ELBO that is too small to count [nats], and that its own noise explains, in standard errors.
-RISE, ERRORS = 0.1, 3.0
+#: A rise of the ELBO that is too small to count [nats], one that its own noise explains, in standard errors, and noise
+#: beyond which no rise could be seen [nats].
+RISE, ERRORS, SCATTER = 0.1, 3.0, 2.0
 #: Steps between lines of progress, and the share of steps that may fail unsaid.
 REPORTED, FAILING = 50, 0.1
 
@@ -152,10 +153,15 @@ def _unsettled(elbo: Array) -> str | None:
     quarter = len(elbo) // 4
     before, last = (part[np.isfinite(part)] for part in (elbo[-2 * quarter : -quarter], elbo[-quarter:]))
     if quarter < 2 or min(len(before), len(last)) < 2:
-        return f"too few steps of the fit ({len(elbo)}) to say whether it has settled; set sampling.steps to 1000 or more"
+        return f"{len(elbo)} steps of a fit are too few to say whether it settled; set sampling.steps to 1000 or more"
     rise = float(last.mean() - before.mean())
-    error = float(np.sqrt(before.var(ddof=1) / len(before) + last.var(ddof=1) / len(last)))
-    if rise <= max(RISE, ERRORS * error):
+    error = ERRORS * float(np.sqrt(before.var(ddof=1) / len(before) + last.var(ddof=1) / len(last)))
+    if error > SCATTER:
+        return (
+            f"the ELBO scatters by {last.std(ddof=1):.2g} nats from step to step, too much to say whether the fit of "
+            "the guide has settled: the posterior is far from Gaussian; use sampling.method=nuts"
+        )
+    if rise <= max(RISE, error):
         return None
     return (
         f"the fit of the guide has not settled: its ELBO still rose by {rise:.2g} nats in the last quarter of "
