@@ -12,10 +12,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpstrf
 from torch import Tensor
 
 from bayes_impedance.config import Config
+from bayes_impedance.engines.gaussian import draw_gaussian
 from bayes_impedance.features import FeatureMap, Features
 from bayes_impedance.kernels.coupled import CoupledInteractionKernel
 from bayes_impedance.kernels.coupled_terms import CoupledProcess, contract
@@ -169,14 +169,14 @@ def _draw_group(
     shared = same_label(x, x, impedance.layout.trajectory)
     common = common if shared is None else common * shared
     rows = [torch.cat([(common * table[i][j]).expand_as(common) for j in range(3)], dim=-1) for i in range(3)]
-    deviation = _sample(torch.cat(rows, dim=-2), generator)
+    deviation = draw_gaussian(torch.cat(rows, dim=-2), generator)
     desired = features.trajectory_mean[:, group : group + 1, :n] + torch.stack(
         deviation.split(n, dim=-1), dim=-1
     )
     columns = [_draw_impedance(process, x, generator) for process in impedance.processes]
     coupled = isinstance(kernel, CoupledInteractionKernel)
     own = kernel.axis_residuals(x[0], x[0]) if coupled else kernel.residual_covariance(x, x)
-    residual = _sample(own, generator)
+    residual = draw_gaussian(own, generator)
     standard = torch.randn(residual.shape, generator=generator, dtype=residual.dtype)
     noise = model.noise_variance.sqrt() * standard
     parts = (desired, torch.stack(columns, dim=3), residual, noise)
@@ -190,38 +190,11 @@ def _draw_impedance(
     if isinstance(process, CoupledProcess):
         n = x.shape[-2]
         covariance = process.gaussian_covariance(x[0], x[0])
-        draw = _sample(covariance.expand(*covariance.shape[:-2], n, n), generator)
+        draw = draw_gaussian(covariance.expand(*covariance.shape[:-2], n, n), generator)
         return contract(process.dyads, process.levels[..., 0] * draw.exp()).movedim(1, -1)
-    draw = _sample(process.gaussian_covariance(x, x), generator)
+    draw = draw_gaussian(process.gaussian_covariance(x, x), generator)
     level = process.level[..., 0]
     return level + draw if process.law == "gaussian" else level * draw.exp()
-
-
-def _sample(covariance: Tensor, generator: torch.Generator) -> Tensor:
-    """A draw of N(0, covariance), `(..., n)`; positive semidefinite is enough."""
-    scale = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
-    # On the scale of correlations rounding does not carry from accelerations over to positions.
-    safe = torch.where(scale > 0, scale, 1.0)
-    correlation = covariance / (safe.unsqueeze(-1) * safe.unsqueeze(-2))
-    standard = torch.randn(scale.shape, generator=generator, dtype=scale.dtype)
-    drawn = [
-        _factor(c) @ z
-        for c, z in zip(
-            correlation.reshape(-1, *correlation.shape[-2:]), standard.flatten(0, -2), strict=True
-        )
-    ]
-    return scale * torch.stack(drawn).reshape(scale.shape)
-
-
-def _factor(correlation: Tensor) -> Tensor:
-    """R with R Rᵀ = `correlation` to rounding, by Cholesky with pivoting: it ends at the numerical rank."""
-    n = correlation.shape[-1]
-    lower, pivots, rank, _ = dpstrf(correlation.numpy(), lower=1)
-    factor = np.tril(lower)
-    factor[:, rank:] = 0.0
-    result = np.empty((n, n))
-    result[pivots - 1] = factor
-    return torch.from_numpy(result)
 
 
 def _pace(time: Array, duration: float, generator: np.random.Generator) -> tuple[Array, Array, Array]:
