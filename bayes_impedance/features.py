@@ -116,8 +116,8 @@ class FeatureMap:
         """Inputs of the samples of `log`; trials with equal label share what trials do not share otherwise.
 
         `trial_labels` maps `trial_key` to a label, so that two logs can be put into one covariance; `observed` leaves
-        out samples without known force, which cannot be conditioned on. `samples`: those of each trial that are asked for,
-        all if None.
+        out samples without known force, which cannot be conditioned on. `samples`: those of each trial that are asked
+        for, all if None.
 
         Raises:
             ConfigurationError: noise of the positions is to be carried, and the motion did not pass the smoother.

@@ -31,10 +31,10 @@ from bayes_impedance.log import InteractionLog
 from bayes_impedance.posterior import Posterior, compute_posterior
 from bayes_impedance.preprocessing import PreparedLog, prepare
 from bayes_impedance.priors import Entry, ForceModel, build_force_model
-from bayes_impedance.training import Progress, TrainingReport, log_evidence, observations, train
 from bayes_impedance.sampling.drawn import DrawnPosterior
 from bayes_impedance.sampling.sample import Hook as SamplingProgress
 from bayes_impedance.sampling.sample import Problem, sample_posterior
+from bayes_impedance.training import Progress, TrainingReport, log_evidence, observations, train
 from bayes_impedance.trajectory_mean import TrajectoryMean
 
 #: Forces that a posterior conditions on: of the training log, of the log at hand, or of both.

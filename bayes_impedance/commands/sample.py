@@ -59,7 +59,9 @@ def sample_command(
     overrides: Annotated[
         list[str] | None,
         typer.Option(
-            "--set", metavar="KEY=VALUE", help="Change one key of sampling, e.g. sampling.draws=1000; repeatable."
+            "--set",
+            metavar="KEY=VALUE",
+            help="Change one key of sampling, e.g. sampling.draws=1000; repeatable.",
         ),
     ] = None,
     figures: Annotated[Path | None, typer.Option(help="Folder for PNG figures.")] = None,
@@ -70,17 +72,20 @@ def sample_command(
     """Draw mass, damping, stiffness and desired trajectory from their posterior given the forces, by Pyro.
 
     The priors are those of MODEL's configuration; its hyperparameters are drawn, too. What chains have drawn is kept
-    beside the netCDF until it is written: after Ctrl-C, a crash or a power cut the same command with --resume continues,
+    beside the netCDF until it is written: after Ctrl-C, a crash or a power cut the same command with --resume goes on,
     and ends with the same draws. Diagnostics are printed with advice, and kept in the file.
     """
     console = Console()
-    check_netcdf_name(out)
+    if out.suffix != SUFFIX:
+        raise OutputError(
+            f"{out}: expected a file name that ends in {SUFFIX} (netCDF), got {out.suffix!r}; name one"
+        )
     check_writable(out)
     unfinished = out.with_name(f"{out.name}.unfinished")
     if unfinished.exists() and not resume:
         raise OutputError(
-            f"{unfinished}: expected no unfinished run of {out.name}, found one; add --resume to continue it, or delete "
-            "the folder to start anew"
+            f"{unfinished}: expected no unfinished run of {out.name}, found one; add --resume to continue it, or "
+            "delete the folder to start anew"
         )
     trained = load_model(model)
     settings = _settings(trained.config, overrides or [], method)
@@ -106,8 +111,8 @@ def _settings(config: Config, overrides: list[str], method: Method | None) -> Sa
     for assignment in overrides:
         if not assignment.strip().startswith("sampling."):
             raise ConfigurationError(
-                f"--set: expected a key of sampling, such as sampling.draws=1000, got {assignment!r}, which is part of the "
-                "model; train another one with it"
+                f"--set: expected a key of sampling, such as sampling.draws=1000, got {assignment!r}, which is part "
+                "of the model; train another one with it"
             )
     own = [] if method is None else [f"sampling.method={method.value}"]
     return override_config(config, [*overrides, *own]).sampling

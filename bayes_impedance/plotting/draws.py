@@ -61,7 +61,11 @@ def plot_drawn_impedance(posterior: DrawnPosterior, group: int = 0) -> Figure:
     if posterior.coupled:
         entries += [(a, b) for a in range(len(axes)) for b in range(a + 1, len(axes))]
     figure, grid = panel_grid(
-        len(IMPEDANCE_ORDER), len(entries), sharex="all", sharey="none", width=4.6 if len(entries) < 3 else 4.0
+        len(IMPEDANCE_ORDER),
+        len(entries),
+        sharex="all",
+        sharey="none",
+        width=4.6 if len(entries) < 3 else 4.0,
     )
     own = posterior.places_of(group)
     abscissa, name = posterior.abscissa(group)
@@ -107,7 +111,7 @@ def plot_drawn_trajectory(posterior: DrawnPosterior, group: int = 0) -> Figure:
 
 def plot_drawn_force(posterior: DrawnPosterior) -> Figure:
     """Measured force of some trials, and the 90 % band of a new measurement there (posterior predictive)."""
-    trials, rows = posterior.observed()
+    trials, rows = posterior.kept(posterior.places.forces)
     axes = posterior.axes
     shown = min(len(trials), TRIALS)
     figure, grid = panel_grid(len(axes), shown, sharex="none", sharey="row")
@@ -142,7 +146,9 @@ def plot_confounding(posterior: DrawnPosterior) -> Figure:
     prior = posterior.prior_impedance(PRIOR_DRAWS)[Latent.STIFFNESS]
     assert parameter.median is not None
     assert parameter.log_sd is not None
-    before = parameter.median[0].item() * np.exp(parameter.log_sd[0].item() * generator.standard_normal(len(prior)))
+    before = parameter.median[0].item() * np.exp(
+        parameter.log_sd[0].item() * generator.standard_normal(len(prior))
+    )
     for a, one in zip(range(len(axes)), posterior.verdicts, strict=False):
         ax = grid[0][a]
         average = np.exp(np.log(matrices[::step, :, :, a, a]).mean(axis=(1, 2)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -80,14 +80,11 @@ def _posterior(posterior: DrawnPosterior) -> xarray.Dataset:
 def _site(posterior: DrawnPosterior, parameter: Parameter, values: Array) -> dict[str, xarray.DataArray]:
     """Draws `(chains, draws, *shape)` of a site; components of a hyperparameter as variables of their own."""
     if parameter.median is None:
-        name = parameter.name.removesuffix("_weights")
-        dims = ("chain", "draw", "group", f"{name}_entry", f"{name}_weight")
-        entries = posterior.entry_names(parameter.shape[1])
-        return {
-            parameter.name: xarray.DataArray(
-                values, dims=dims, coords={f"{name}_entry": entries}, attrs={"units": "1"}
-            )
-        }
+        quantity = parameter.name.removesuffix("_weights")
+        layout = ("chain", "draw", "group", f"{quantity}_entry", f"{quantity}_weight")
+        named = {f"{quantity}_entry": posterior.entry_names(parameter.shape[1])}
+        weights = xarray.DataArray(values, dims=layout, coords=named, attrs={"units": "1"})
+        return {parameter.name: weights}
     result = {}
     for c, (label, unit) in enumerate(zip(parameter.labels, parameter.units, strict=True)):
         name = f"{parameter.name}_{label}" if label and len(parameter.labels) > 1 else parameter.name
@@ -143,9 +140,7 @@ def _predictive(posterior: DrawnPosterior) -> xarray.Dataset:
 def _stats(posterior: DrawnPosterior) -> xarray.Dataset:
     return xarray.Dataset(
         {
-            name: xarray.DataArray(
-                values, dims=("chain", "draw"), attrs={"units": STAT_UNITS.get(name, "1")}
-            )
+            name: xarray.DataArray(values, dims=("chain", "draw"), attrs={"units": STAT_UNITS.get(name, "1")})
             for name, values in posterior.draws.stats.items()
         }
     )
@@ -161,7 +156,13 @@ def _observed(posterior: DrawnPosterior) -> xarray.Dataset:
 
 
 def _constant(posterior: DrawnPosterior) -> xarray.Dataset:
-    units = {"position": "m", "velocity": "m/s", "acceleration": "m/s^2", "reference": "m", "perturbation": "N"}
+    units = {
+        "position": "m",
+        "velocity": "m/s",
+        "acceleration": "m/s^2",
+        "reference": "m",
+        "perturbation": "N",
+    }
     arrays = {name: posterior.recorded(name) for name in units}
     return xarray.Dataset(
         {
@@ -179,10 +180,9 @@ def _place_dims(posterior: DrawnPosterior) -> tuple[str, ...]:
     return ("chain", "draw", posterior.places.dimension)
 
 
-def _place_coordinates(posterior: DrawnPosterior) -> Mapping[str, object]:
+def _place_coordinates(posterior: DrawnPosterior) -> dict[str, object]:
     coordinates: dict[str, object] = {**_axes(posterior), "group": list(posterior.groups)}
-    trials = [trial for trial, rows in zip(posterior.places.log.trials, posterior.places.places, strict=True) if len(rows)]
-    rows = [rows for rows in posterior.places.places if len(rows)]
+    trials, rows = posterior.kept(posterior.places.places)
     if posterior.places.dimension == "phase":
         assert trials[0].phase is not None
         return coordinates | {"phase": trials[0].phase}
@@ -197,8 +197,8 @@ def _place_coordinates(posterior: DrawnPosterior) -> Mapping[str, object]:
     }  # fmt: skip
 
 
-def _sample_coordinates(posterior: DrawnPosterior) -> Mapping[str, object]:
-    trials, rows = posterior.observed()
+def _sample_coordinates(posterior: DrawnPosterior) -> dict[str, object]:
+    trials, rows = posterior.kept(posterior.places.forces)
     time = np.concatenate([trial.time[own] for trial, own in zip(trials, rows, strict=True)])
     coordinates: dict[str, object] = {
         "sample_time": ("sample", time, {"units": "s"}),

@@ -8,7 +8,7 @@ integrated out by an engine given impedance (docs/model.md §13), the determinan
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -67,12 +67,12 @@ class JointDensity(TiltedDensity):
         )
         sizes = [parameter.size for parameter in self.parameters]
         super().__init__(sum(sizes[: len(QUANTITIES)]), np.ones(sum(sizes), dtype=bool))
-        self._sizes = sizes
+        self.sizes = sizes
         medians = {p.name: p.median.expand(p.shape) for p in self.parameters if p.median is not None}
         with torch.no_grad():
             processes = self.processes(medians)
             self._fixed = tuple(
-                None if self._varies(name) else function.design(features.inputs)
+                None if self.varies(name) else function.design(features.inputs)
                 for name, function in zip(QUANTITIES, self._functions, strict=True)
             )
         self.engine_choice: EngineChoice = choose_engine(
@@ -87,7 +87,7 @@ class JointDensity(TiltedDensity):
 
     def values(self, standard: Tensor) -> dict[str, Tensor]:
         """Values of all sites at coordinates `(..., size)`, by name."""
-        parts = standard.split(self._sizes, dim=-1)
+        parts = standard.split(self.sizes, dim=-1)
         return {p.name: p.value(part) for p, part in zip(self.parameters, parts, strict=True)}
 
     def standard(self, values: Mapping[str, Tensor]) -> Tensor:
@@ -109,7 +109,7 @@ class JointDensity(TiltedDensity):
         """K, D and M as functions, at the log-SDs and length scales among the values."""
         return tuple(
             replace(function, covariance=self._covariance(name, function.covariance, values, scale="log_sd"))
-            if self._varies(name)
+            if self.varies(name)
             else function
             for name, function in zip(QUANTITIES, self._functions, strict=True)
         )
@@ -166,17 +166,9 @@ class JointDensity(TiltedDensity):
         Raises:
             NotPositiveDefiniteError: it is not finite there.
         """
-        standard = torch.from_numpy(point).clone().requires_grad_()
-        value = self.log_density(standard)
-        (gradient,) = torch.autograd.grad(value, standard)
-        if not (bool(value.isfinite()) and bool(gradient.isfinite().all())):
-            raise NotPositiveDefiniteError(
-                "expected a finite posterior density, found one that overflows, or its gradient does; check log.units, "
-                "and that the medians under model are of the size that their unit lets expect"
-            )
-        return float(value.detach()), gradient.numpy()
+        return differentiated(self.log_density, point)
 
-    def _varies(self, quantity: str) -> bool:
+    def varies(self, quantity: str) -> bool:
         """Whether how a function varies is sampled, too."""
         return any(entry.name.startswith(f"{quantity}.") for entry in self._learned)
 
@@ -192,6 +184,23 @@ class JointDensity(TiltedDensity):
             if (entry := self._entries.get(f"{name}.{key}")) is not None
         }
         return StationaryCovariance.like(kernel, parts[scale], parts.get("length_scale"), parts.get("shape"))
+
+
+def differentiated(log_density: Callable[[Tensor], Tensor], point: Array) -> tuple[float, Array]:
+    """A log density at a point, and its gradient.
+
+    Raises:
+        NotPositiveDefiniteError: one of the two is not finite.
+    """
+    coordinates = torch.from_numpy(point).clone().requires_grad_()
+    value = log_density(coordinates)
+    (gradient,) = torch.autograd.grad(value, coordinates)
+    if not (bool(value.isfinite()) and bool(gradient.isfinite().all())):
+        raise NotPositiveDefiniteError(
+            "expected a finite posterior density, found one that overflows, or its gradient does; check log.units, and "
+            "that the medians under model are of the size that their unit lets expect"
+        )
+    return float(value.detach()), gradient.numpy()
 
 
 def weights(values: Mapping[str, Tensor]) -> tuple[Tensor, ...]:

@@ -17,7 +17,7 @@ from bayes_impedance.impedance_functions.symmetric import entries
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
 from bayes_impedance.preprocessing import PreparedLog, PreparedTrial
 from bayes_impedance.sampling.density import JointDensity
-from bayes_impedance.sampling.diagnostics import Diagnosis
+from bayes_impedance.sampling.diagnosis import Diagnosis
 from bayes_impedance.sampling.draws import Draws
 from bayes_impedance.sampling.parameters import Parameter
 from bayes_impedance.sampling.places import Places
@@ -50,7 +50,7 @@ class DrawnPosterior:
     @property
     def log(self) -> PreparedLog:
         """The trials of the log."""
-        return PreparedLog(self.axes, tuple(self.observed()[0]))
+        return PreparedLog(self.axes, tuple(self.kept(self.places.forces)[0]))
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -98,7 +98,7 @@ class DrawnPosterior:
         return self._at_places(self.latents[latent])
 
     def at_places(self, latent: Latent) -> Array:
-        """Desired trajectory or one of its derivatives at the places, `(chains, draws, …, axes)` [unit of the latent]."""
+        """Desired trajectory or a derivative at the places, `(chains, draws, …, axes)` [unit of the latent]."""
         return self._at_places(np.moveaxis(self.latents[latent], 1, -1))
 
     def at_samples(self, latent: Latent) -> Array:
@@ -107,21 +107,20 @@ class DrawnPosterior:
         return self._by_chain(values[:, *self._index(self.places.forces)])
 
     def first_place(self, values: Array) -> Array:
-        """Of values at the places `(chains, draws, …)` those at the first of each group, `(chains, draws, groups, …)`."""
+        """Of values at the places `(chains, draws, …)` those at the first of each group, in their order."""
         if self.places.dimension == "phase":
             return values[:, :, :, 0]
         owners, _ = self._index(self.places.places)
         return values[:, :, [int(np.argmax(owners == g)) for g in range(len(self.groups))]]
 
-    def observed(self) -> tuple[list[PreparedTrial], list[Integers]]:
-        """Trials of the log, and which of their samples forces are kept of."""
-        pairs = zip(self.places.log.trials, self.places.forces, strict=True)
-        kept = [(trial, rows) for trial, rows in pairs if len(rows)]
-        return [trial for trial, _ in kept], [rows for _, rows in kept]
+    def kept(self, which: tuple[Integers, ...]) -> tuple[list[PreparedTrial], list[Integers]]:
+        """Motions that have samples in `which`, and these samples."""
+        pairs = [pair for pair in zip(self.places.log.trials, which, strict=True) if len(pair[1])]
+        return [trial for trial, _ in pairs], [rows for _, rows in pairs]
 
     def recorded(self, name: str) -> Array | None:
-        """An array of the trials at the samples of which forces are kept, `(samples, axes)`; None where one has none."""
-        trials, rows = self.observed()
+        """An array of the trials where forces are kept, `(samples, axes)`; None where a trial has none."""
+        trials, rows = self.kept(self.places.forces)
         arrays = [getattr(trial, name) for trial in trials]
         if any(array is None for array in arrays):
             return None
@@ -129,7 +128,7 @@ class DrawnPosterior:
 
     def trials_of(self, group: int) -> list[PreparedTrial]:
         """Trials of the log that belong to a group."""
-        return [trial for trial in self.observed()[0] if trial.group == self.groups[group]]
+        return [trial for trial in self.log.trials if trial.group == self.groups[group]]
 
     def places_of(self, group: int) -> Integers:
         """Which of all places, one after another, belong to a group, in the order of phase or time."""
@@ -143,10 +142,11 @@ class DrawnPosterior:
 
     def abscissa(self, group: int) -> tuple[Array, str]:
         """Phase of the places of a group, or time of its only trial [s], else their number; and what it is."""
+        trials, samples = self.kept(self.places.places)
         kept = [
             (trial, rows)
-            for trial, rows in zip(self.places.log.trials, self.places.places, strict=True)
-            if len(rows) and trial.group == self.groups[group]
+            for trial, rows in zip(trials, samples, strict=True)
+            if trial.group == self.groups[group]
         ]
         trial, rows = kept[0]
         if self.places.dimension == "phase" and trial.phase is not None:

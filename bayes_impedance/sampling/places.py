@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,8 +72,9 @@ def average_motion(log: PreparedLog, group: str, places: int) -> PreparedTrial:
     }
     repetition = np.zeros(places, dtype=np.int64)
     # Of the group's own name, for names of trials differ.
-    naming = {"name": f"{AVERAGE} of {group}", "group": group, "source": "memory"}
-    return PreparedTrial(**naming, **(values | {"phase": phase}), repetition=repetition)
+    named = {"name": f"{AVERAGE} of {group}", "group": group, "source": "memory"}
+    arrays: dict[str, Any] = {**named, **values, "phase": phase, "repetition": repetition}
+    return PreparedTrial(**arrays)
 
 
 def _repetitions(log: PreparedLog, group: str) -> Iterator[PreparedTrial]:
@@ -81,8 +83,8 @@ def _repetitions(log: PreparedLog, group: str) -> Iterator[PreparedTrial]:
             for number in np.unique(trial.repetition):
                 rows = np.flatnonzero(trial.repetition == number)
                 arrays = {name: getattr(trial, name) for name in ARRAYS}
-                known = {name: None if array is None else array[rows] for name, array in arrays.items()}
-                yield replace(trial, **known, truth={})
+                own: dict[str, Any] = {k: None if v is None else v[rows] for k, v in arrays.items()}
+                yield replace(trial, **own, truth={})
 
 
 def _phase(trial: PreparedTrial) -> Array:

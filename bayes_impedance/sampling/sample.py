@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bayes_impedance.config import Config, SamplingConfig
+from bayes_impedance.config import Config, SamplingConfig, TrainingConfig
 from bayes_impedance.errors import LogError
 from bayes_impedance.features import FeatureMap, count_repetitions, label_trials
 from bayes_impedance.identifiability import was_perturbed
@@ -19,6 +19,7 @@ from bayes_impedance.impedance_functions.threads import one_thread
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER
 from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.priors import build_force_model
+from bayes_impedance.sampling.centred import CentredDensity
 from bayes_impedance.sampling.chains import sample_nuts
 from bayes_impedance.sampling.dataset import names_of_coordinates
 from bayes_impedance.sampling.density import JointDensity
@@ -29,7 +30,7 @@ from bayes_impedance.sampling.importance import laplace_draws
 from bayes_impedance.sampling.latents import draw_latents
 from bayes_impedance.sampling.parameters import QUANTITIES
 from bayes_impedance.sampling.places import choose_places
-from bayes_impedance.sampling.start import Start, find_start
+from bayes_impedance.sampling.start import find_start
 from bayes_impedance.sampling.support import Evidence, exact_off_diagonals, exact_verdicts
 from bayes_impedance.sampling.variational import svi_draws
 from bayes_impedance.trajectory_mean import TrajectoryMean
@@ -86,33 +87,39 @@ def sample_posterior(
     model = build_force_model(config, feature_map)
     inducing = problem.inducing or choose_inducing(config, model, given)
     density = JointDensity(config, model, given, inducing)
-    start = find_start(density, config.training, progress=_climbing(hook))
-    draws = draw(density, start, settings, _sampling(hook), checkpoint)
+    draws = draw(density, config.training, settings, hook, checkpoint)
     standard = draws.standard.reshape(-1, density.size)
     latents = draw_latents(density, standard, target, settings.seed, _drawing(hook))
-    diagnosis = diagnose(draws, names_of_coordinates(density.parameters, log.axes), settings)
+    diagnosis = diagnose(draws, names_of_coordinates(density.parameters, log.axes), settings.max_tree_depth)
     unsaid = DrawnPosterior(config, density, draws, places, target, latents, diagnosis, ())
     return _with_verdicts(unsaid, problem)
 
 
 def draw(
     density: JointDensity,
-    start: Start,
+    training: TrainingConfig,
     settings: SamplingConfig,
-    progress: Progress | None = None,
+    hook: Hook | None = None,
     checkpoint: Path | None = None,
 ) -> Draws:
-    """Draws of the density by the method that is set.
+    """Draws of the density by the method that is set, from the mode of greatest evidence on.
+
+    Samplers move in the coordinates of `CentredDensity`; `lp` is the density of those.
 
     Raises:
+        NotPositiveDefiniteError: the density is not finite about its mode.
         SamplingError: every chain died.
         OutputError: the checkpoint is of another posterior, or cannot be written.
     """
+    centred = CentredDensity(density)
+    start = find_start(centred, training, progress=_climbing(hook))
     if settings.method == "svi":
-        return svi_draws(density, start, settings, progress)
-    if settings.method == "laplace":
-        return laplace_draws(density, start, settings, progress)
-    return sample_nuts(density, start, settings, progress, checkpoint)
+        found = svi_draws(centred, start, settings, _sampling(hook))
+    elif settings.method == "laplace":
+        found = laplace_draws(centred, start, settings, _sampling(hook))
+    else:
+        found = sample_nuts(centred, start, settings, _sampling(hook), checkpoint)
+    return replace(found, standard=centred.all_standard(found.standard))
 
 
 def _check_forces(problem: Problem) -> None:
@@ -120,8 +127,8 @@ def _check_forces(problem: Problem) -> None:
     lacking = [group for group in problem.log.groups if group not in known]
     if lacking:
         raise LogError(
-            f"expected forces of every group to sample from, found none of group '{lacking[0]}'; name a log with force, "
-            "or leave that group out"
+            f"expected forces of every group to sample from, found none of group '{lacking[0]}'; name a log with "
+            "force, or leave that group out"
         )
 
 
@@ -171,7 +178,7 @@ def _sampling(hook: Hook | None) -> Progress | None:
     return lambda chain, done, total, line: hook(f"chain {chain + 1}", done, total, line)
 
 
-def _drawing(hook: Hook | None) -> Progress | None:
+def _drawing(hook: Hook | None) -> Callable[[int, int], None] | None:
     if hook is None:
         return None
-    return lambda _, done, total, line: hook("latents", done, total, line)
+    return lambda done, total: hook("latents", done, total, "")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from arviz_stats.base import array_stats
@@ -63,8 +63,8 @@ def exact_verdicts(
 ) -> list[ExactVerdict]:
     """Verdicts on stiffness, damping and mass of each axis, averaged over places.
 
-    As the verdicts on Gaussian posteriors (docs/model.md §6); besides, nothing is claimed of a stiffness whose logarithm
-    goes with that of the SD of the desired trajectory.
+    As the verdicts on Gaussian posteriors (docs/model.md §6); besides, nothing is claimed of what goes with the SD of
+    the desired trajectory.
     """
     confounded = confounding(config, repetitions, perturbed)
     return [
@@ -74,9 +74,7 @@ def exact_verdicts(
     ]
 
 
-def _verdict(
-    evidence: Evidence, latent: Latent, a: int, axis: str, confounded: str | None
-) -> ExactVerdict:
+def _verdict(evidence: Evidence, latent: Latent, a: int, axis: str, confounded: str | None) -> ExactVerdict:
     draws, prior = evidence.impedance[latent][..., a, a], evidence.prior[latent][..., a, a]
     log_draws, log_prior = np.log(draws), np.log(prior)
     before = log_prior.var(axis=0).mean()
@@ -96,7 +94,9 @@ def _verdict(
     bands = _bands(draws, prior)
     sentence = verdict_sentence(latent, axis, contraction, support, confounded, is_fixed)
     if sensitivity > SENSITIVE and support is not Support.PRIOR_ONLY:
-        sentence += f" It moves with its prior (sensitivity {rounded(sensitivity)}): look at another prior, too."
+        sentence += (
+            f" It moves with its prior (sensitivity {rounded(sensitivity)}): look at another prior, too."
+        )
     verdict = Verdict(latent, axis, float(draws.mean()), *bands, contraction, support, sentence)
     return ExactVerdict(verdict, correlation, sensitivity)
 
