@@ -201,9 +201,7 @@ class JointDensity(TiltedDensity):
 
 def _plain(kernel: Stationary) -> StationaryCovariance:
     """What a kernel computes, at the hyperparameters it has."""
-    lengthscale, shape = (
-        None if own is None else own.detach() for own in (kernel.lengthscale, kernel.shape)
-    )
+    lengthscale, shape = (None if own is None else own.detach() for own in (kernel.lengthscale, kernel.shape))
     return StationaryCovariance.like(kernel, kernel.sd.detach(), lengthscale, shape)
 
 

@@ -31,8 +31,8 @@ AVERAGES = ("prox_center", "_x_avg", "_g_avg", "_t", "_x_t")
 class ShrunkMassMatrix(BlockMassMatrix):
     """Inverse mass matrix (n Ŝ + w I)/(n + w): the covariance Ŝ of n draws, shrunk towards the identity.
 
-    In coordinates whitened by Laplace's approximation that is its curvature, w = 5 `size`. The covariance of hardly more
-    draws than coordinates is almost singular, and the trees that it grows are several times as deep.
+    In coordinates whitened by Laplace's approximation that is its curvature, w = 5 `size`. The covariance of hardly
+    more draws than coordinates is almost singular, and the trees that it grows are several times as deep.
     """
 
     def end_adaptation(self) -> None:
