@@ -16,14 +16,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bayes_impedance.impedance_functions.tilted import TiltedDensity
-from bayes_impedance.sampling.density import JointDensity, differentiated
+from bayes_impedance.sampling.density import JointDensity, SampledDensity
 from bayes_impedance.sampling.parameters import QUANTITIES
 
 Array = NDArray[np.float64]
 
 
-class CentredDensity(TiltedDensity):
+class CentredDensity(SampledDensity):
     """A `JointDensity` over c in place of v, all else as it is."""
 
     def __init__(self, density: JointDensity) -> None:
@@ -31,11 +30,6 @@ class CentredDensity(TiltedDensity):
         self.density = density
         with torch.no_grad():
             self._reference = self._roots(torch.zeros(density.size, dtype=torch.float64))
-
-    @property
-    def size(self) -> int:
-        """Number of coordinates."""
-        return self.density.size
 
     def standard(self, coordinates: Tensor) -> tuple[Tensor, Tensor]:
         """The standard normal coordinates `(size,)` that they stand for, and the logarithm of the Jacobian [nats]."""
@@ -69,14 +63,6 @@ class CentredDensity(TiltedDensity):
         """
         standard, jacobian = self.standard(coordinates)
         return self.density.log_density(standard) + jacobian
-
-    def joint(self, point: Array) -> tuple[float, Array]:
-        """`log_density` and its gradient.
-
-        Raises:
-            NotPositiveDefiniteError: it is not finite there.
-        """
-        return differentiated(self.log_density, point)
 
     def _roots(self, coordinates: Tensor) -> dict[int, Tensor]:
         """L of each entry of K, D and M `(entries, Z, Z)`, where how they vary is sampled."""

@@ -8,7 +8,8 @@ integrated out by an engine given impedance (docs/model.md §13), the determinan
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -41,7 +42,40 @@ Array = NDArray[np.float64]
 FEW = 50
 
 
-class JointDensity(TiltedDensity):
+class SampledDensity(TiltedDensity):
+    """A log density that samplers climb and walk on, over coordinates that are near standard normal before any force."""
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return len(self.free)
+
+    @abstractmethod
+    def log_density(self, coordinates: Tensor) -> Tensor:
+        """log p(coordinates | u) up to a constant, at coordinates `(size,)` [nats].
+
+        Raises:
+            NotPositiveDefiniteError: it is not finite there.
+        """
+
+    def joint(self, point: Array) -> tuple[float, Array]:
+        """`log_density` and its gradient.
+
+        Raises:
+            NotPositiveDefiniteError: it is not finite there.
+        """
+        coordinates = torch.from_numpy(point).clone().requires_grad_()
+        value = self.log_density(coordinates)
+        (gradient,) = torch.autograd.grad(value, coordinates)
+        if not (bool(value.isfinite()) and bool(gradient.isfinite().all())):
+            raise NotPositiveDefiniteError(
+                "expected a finite posterior density, found one that overflows, or its gradient does; check log.units, "
+                "and that the medians under model are of the size that their unit lets expect"
+            )
+        return float(value.detach()), gradient.numpy()
+
+
+class JointDensity(SampledDensity):
     """Log density of weights and hyperparameters given the forces of `features`.
 
     `parameters` in the order of their coordinates; `engine_choice` says which engine marginalises, and why.
@@ -56,8 +90,18 @@ class JointDensity(TiltedDensity):
     ) -> None:
         self.config, self.features = config, features
         self.coupled = config.model.axes == "coupled"
-        self._model = model
-        self._functions = build_functions(config, model, inducing)
+        known = Processes.of(model, config.model.desired_trajectory.periodic)
+        # No module stays: other processes take the density over, and those of gpytorch do not travel.
+        self._known = replace(
+            known,
+            trajectory=_plain(known.trajectory),
+            residual=tuple(map(_plain, known.residual)),
+            noise_variance=known.noise_variance.detach(),
+        )
+        self._functions = tuple(
+            replace(function, covariance=_plain(function.covariance))
+            for function in build_functions(config, model, inducing)
+        )
         self._entries = {entry.name: entry for entry in model.entries}
         # Components that nothing learns stay where the hyperprior has its median.
         self._learned: tuple[Entry, ...] = tuple(hyperparameters_of(model, self._functions))
@@ -80,11 +124,6 @@ class JointDensity(TiltedDensity):
         )
         self.engine = build_engine(self.engine_choice.name, config.engine, processes, features, self.coupled)
 
-    @property
-    def size(self) -> int:
-        """Number of coordinates."""
-        return len(self.free)
-
     def values(self, standard: Tensor) -> dict[str, Tensor]:
         """Values of all sites at coordinates `(..., size)`, by name."""
         parts = standard.split(self.sizes, dim=-1)
@@ -96,7 +135,7 @@ class JointDensity(TiltedDensity):
 
     def processes(self, values: Mapping[str, Tensor]) -> Processes:
         """Desired trajectory, residual force and noise at the values of their sites."""
-        known = Processes.of(self._model, self.config.model.desired_trajectory.periodic)
+        known = self._known
         noise = filled(self._entries["noise_sd"], values)[:, 0].square()
         terms = [
             self._covariance(name, term, values)
@@ -148,25 +187,17 @@ class JointDensity(TiltedDensity):
             return value
         return value + log_jacobian(loop, impedance, self.features.valid, self.coupled).sum()
 
-    def log_density(self, standard: Tensor) -> Tensor:
+    def log_density(self, coordinates: Tensor) -> Tensor:
         """log p(z | u) up to a constant, at z `(size,)` [nats].
 
         Raises:
             NotPositiveDefiniteError: see `log_likelihood`.
         """
-        return self.log_likelihood(self.values(standard)) - 0.5 * standard.square().sum()
+        return self.log_likelihood(self.values(coordinates)) - 0.5 * coordinates.square().sum()
 
     def is_constant(self, quantity: int) -> bool:
         """Whether K, D or M (0, 1, 2) does not depend on an input."""
         return self._functions[quantity].inducing is None
-
-    def joint(self, point: Array) -> tuple[float, Array]:
-        """`log_density` and its gradient.
-
-        Raises:
-            NotPositiveDefiniteError: it is not finite there.
-        """
-        return differentiated(self.log_density, point)
 
     def varies(self, quantity: str) -> bool:
         """Whether how a function varies is sampled, too."""
@@ -186,21 +217,10 @@ class JointDensity(TiltedDensity):
         return StationaryCovariance.like(kernel, parts[scale], parts.get("length_scale"), parts.get("shape"))
 
 
-def differentiated(log_density: Callable[[Tensor], Tensor], point: Array) -> tuple[float, Array]:
-    """A log density at a point, and its gradient.
-
-    Raises:
-        NotPositiveDefiniteError: one of the two is not finite.
-    """
-    coordinates = torch.from_numpy(point).clone().requires_grad_()
-    value = log_density(coordinates)
-    (gradient,) = torch.autograd.grad(value, coordinates)
-    if not (bool(value.isfinite()) and bool(gradient.isfinite().all())):
-        raise NotPositiveDefiniteError(
-            "expected a finite posterior density, found one that overflows, or its gradient does; check log.units, and "
-            "that the medians under model are of the size that their unit lets expect"
-        )
-    return float(value.detach()), gradient.numpy()
+def _plain(kernel: Stationary) -> StationaryCovariance:
+    """What a kernel computes, at the hyperparameters it has."""
+    lengthscale, shape = (None if own is None else own.detach() for own in (kernel.lengthscale, kernel.shape))
+    return StationaryCovariance.like(kernel, kernel.sd.detach(), lengthscale, shape)
 
 
 def weights(values: Mapping[str, Tensor]) -> tuple[Tensor, ...]:

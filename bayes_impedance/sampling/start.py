@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bayes_impedance.config import TrainingConfig
 from bayes_impedance.impedance_functions import laplace
 from bayes_impedance.impedance_functions.fit import take_turns
-from bayes_impedance.impedance_functions.tilted import TiltedDensity
+from bayes_impedance.sampling.density import SampledDensity
 
 Array = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ class Start:
 
 
 def find_start(
-    density: TiltedDensity,
+    density: SampledDensity,
     training: TrainingConfig,
     near: Array | None = None,
     progress: Callable[[int, float], None] | None = None,
@@ -50,7 +50,7 @@ def find_start(
     Raises:
         NotPositiveDefiniteError: the density is not finite somewhere on the way.
     """
-    begin = np.zeros(len(density.free)) if near is None else near
+    begin = np.zeros(density.size) if near is None else near
     point, precision, climb = take_turns(
         density,
         begin,
