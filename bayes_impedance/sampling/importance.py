@@ -7,6 +7,7 @@ weights that are smoothed by the fitted tail correct the approximation, beyond n
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,12 +67,9 @@ def log_densities(
     values = np.full(len(standard), -np.inf)
     with torch.no_grad(), one_thread():
         for i, point in enumerate(torch.from_numpy(standard)):
-            try:
+            with contextlib.suppress(NotPositiveDefiniteError):
                 value = float(density.log_density(point))
-            except NotPositiveDefiniteError:
-                continue
-            if np.isfinite(value):
-                values[i] = value
+                values[i] = value if np.isfinite(value) else -np.inf
             if progress is not None and (done + i + 1) % REPORTED == 0:
                 progress(0, done + i + 1, done + len(standard), "importance weights")
     return values
