@@ -7,6 +7,7 @@ weights that are smoothed by the fitted tail correct the approximation, beyond n
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,12 +67,9 @@ def log_densities(
     values = np.full(len(standard), -np.inf)
     with torch.no_grad(), one_thread():
         for i, point in enumerate(torch.from_numpy(standard)):
-            try:
+            with contextlib.suppress(NotPositiveDefiniteError):
                 value = float(density.log_density(point))
-            except NotPositiveDefiniteError:
-                continue
-            if np.isfinite(value):
-                values[i] = value
+                values[i] = value if np.isfinite(value) else -np.inf
             if progress is not None and (done + i + 1) % REPORTED == 0:
                 progress(0, done + i + 1, done + len(standard), "importance weights")
     return values
@@ -189,7 +187,10 @@ def _propose(
     first = weigh(standard, values, log_t(steps))
     needed = PROPOSALS * ENOUGH * wanted / first.effective
     more = min(int(needed), ROUNDS * wanted) - PROPOSALS
-    if first.pareto_k > TRUSTED_K or more <= 0:
+    if first.pareto_k > TRUSTED_K:
+        # One tail of a thousand is known to .15 only, and where it is heavy more proposals cost time for nothing.
+        more = PROPOSALS
+    if more <= 0:
         return steps, first
     steps = np.concatenate([steps, proposals(more, density.size, generator)])
     standard = approximation.at(steps)

@@ -76,18 +76,21 @@ def fit_guide(
     nothing. Neither Pyro's parameters nor the state of torch's generator are touched.
     """
     root = torch.from_numpy(start.root)
+    flat = torch.zeros(density.size, dtype=torch.float64)
+
+    def steps() -> Tensor:
+        # Without a density of its own: the factor has everything.
+        return pyro.sample("y", dist.Normal(flat, 1.0).to_event(1).mask(False))
 
     def model() -> None:
-        flat = torch.zeros(density.size, dtype=torch.float64)
-        # A flat prior: the factor has everything.
-        y = pyro.sample("y", dist.Normal(flat, 1.0).to_event(1).mask(False))
+        y = steps()
         value, gradient = density.joint(start.at(y.detach().numpy()))
         slope = torch.from_numpy(gradient) @ root
         pyro.factor("posterior", value + (slope * (y - y.detach())).sum())
 
     elbo = np.full(settings.steps, np.nan)
     with _apart(settings.seed), one_thread():
-        guide = _guide(settings.guide, model, density.size)
+        guide = _guide(settings.guide, steps, flat)
         fall = LAST ** (1.0 / settings.steps)
         svi = SVI(model, guide, ClippedAdam({"lr": RATE, "lrd": fall}), Trace_ELBO())
         for step in range(settings.steps):
@@ -109,16 +112,18 @@ def _apart(seed: int) -> Iterator[None]:
         yield
 
 
-def _guide(name: Guide, model: Callable[[], None], size: int) -> AutoContinuous:
-    """A guide that begins at N(0, I)."""
-    at_mode = init_to_value(values={"y": torch.zeros(size, dtype=torch.float64)})
+def _guide(name: Guide, sites: Callable[[], Tensor], zero: Tensor) -> AutoContinuous:
+    """A guide to `sites` that begins at N(0, I)."""
+    at_mode = init_to_value(values={"y": zero})
     if name == "multivariate_normal":
-        return AutoMultivariateNormal(model, init_loc_fn=at_mode, init_scale=1.0)
-    guide = AutoLowRankMultivariateNormal(model, init_loc_fn=at_mode, init_scale=1.0)
+        guide = AutoMultivariateNormal(sites, init_loc_fn=at_mode, init_scale=1.0)
+        guide()
+        return guide
+    guide = AutoLowRankMultivariateNormal(sites, init_loc_fn=at_mode, init_scale=1.0)
     guide()
     with torch.no_grad():
         guide.cov_factor.mul_(SMALL)
-        guide.scale = torch.ones(size, dtype=torch.float64)
+        guide.scale = torch.ones_like(zero)
     return guide
 
 
@@ -156,14 +161,14 @@ def _unsettled(elbo: Array) -> str | None:
         return f"{len(elbo)} steps of a fit are too few to say whether it settled; set sampling.steps to 1000 or more"
     rise = float(last.mean() - before.mean())
     error = ERRORS * float(np.sqrt(before.var(ddof=1) / len(before) + last.var(ddof=1) / len(last)))
+    if rise > max(RISE, error):
+        return (
+            f"the fit of the guide has not settled: its ELBO still rose by {rise:.2g} nats in the last quarter of "
+            f"{len(elbo)} steps; set sampling.steps to {2 * len(elbo)}"
+        )
     if error > SCATTER:
         return (
             f"the ELBO scatters by {last.std(ddof=1):.2g} nats from step to step, too much to say whether the fit of "
             "the guide has settled: the posterior is far from Gaussian; use sampling.method=nuts"
         )
-    if rise <= max(RISE, error):
-        return None
-    return (
-        f"the fit of the guide has not settled: its ELBO still rose by {rise:.2g} nats in the last quarter of "
-        f"{len(elbo)} steps; set sampling.steps to {2 * len(elbo)}"
-    )
+    return None
