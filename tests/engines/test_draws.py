@@ -1,7 +1,7 @@
 """Joint draws given impedance: as maps of standard normal numbers against dense algebra, and by their moments.
 
-Given forces a draw is mean + J z, z ~ N(0, I): fed with unit vectors in place of random numbers an engine shows the mean
-and J, whose square is the covariance of all latents at all samples, without sampling error.
+Given forces a draw is mean + J z, z ~ N(0, I): fed with unit vectors in place of random numbers an engine shows the
+mean and J, whose square is the covariance of all latents at all samples, without sampling error.
 """
 
 from dataclasses import replace
@@ -63,7 +63,7 @@ def valid(features):
 def target_of(problem):
     """Some samples of the data, then the same ones a little further, then in two trials that were never seen."""
     features, layout = problem.features, problem.processes.layout
-    rows = torch.arange(0, features.inputs.shape[2], 5)
+    rows = torch.arange(0, features.inputs.shape[2], 7)
     own = [int(c) for term in problem.processes.residual if term.num_dims for c in term.active_dims]
     labels = [column for column in (layout.trajectory, layout.residual) if column is not None]
     same = features.inputs[:, :, rows]
@@ -274,9 +274,9 @@ PERIODIC = (*SE_OVER_TIME, "engine.impedance=map", "model.desired_trajectory.per
     ("name", "overrides", "count"),
     [
         ("markov", OFFSET, 1000),
-        ("lowrank", SE_OFFSET, 400),
-        ("lowrank", PERIODIC, 400),
-        ("dense", OFFSET, 400),
+        ("lowrank", SE_OFFSET, 300),
+        ("lowrank", PERIODIC, 300),
+        ("dense", OFFSET, 200),
     ],
 )
 def test_moments_of_many_draws_are_those_of_the_posterior(name, overrides, count):
@@ -290,7 +290,7 @@ def test_moments_of_many_draws_are_those_of_the_posterior(name, overrides, count
         sample = torch.stack([drawn[latent] for drawn in draws])
         error = (sample.mean(0) - mean) / (variance / count).sqrt()
         ratio = (sample.var(0) / variance - 1.0) / (2.0 / count) ** 0.5
-        # Of 48 normal numbers the largest is above 4.5 in 3 of 10 000 seeds.
+        # The largest of so few normal numbers is above 4.5 in one of a thousand seeds; variances have a longer tail.
         assert error.abs().max() < 4.5, latent
         assert ratio.abs().max() < 5.0, latent
 
