@@ -16,6 +16,7 @@ from bayes_impedance.outputs import check_writable, prepare_folder
 from bayes_impedance.persistence import load_model
 from bayes_impedance.plotting.draws import save_draw_figures
 from bayes_impedance.readers import read_log
+from bayes_impedance.sampling.checkpoint import Checkpoint
 from bayes_impedance.sampling.dataset import save_netcdf
 
 SUFFIX = ".nc"
@@ -81,6 +82,7 @@ def sample_command(
             f"{out}: expected a file name that ends in {SUFFIX} (netCDF), got {out.suffix!r}; name one"
         )
     check_writable(out)
+    # Beside the netCDF, on the same disk.
     unfinished = out.with_name(f"{out.name}.unfinished")
     if unfinished.exists() and not resume:
         raise OutputError(
@@ -97,7 +99,7 @@ def sample_command(
     with terminal.sampling_progress(console) as hook:
         posterior = trained.sample(log, given.value, settings, hook, unfinished)
     save_netcdf(posterior, out)
-    remove_checkpoint(unfinished)
+    Checkpoint(unfinished, {}).remove()
     console.print(str(posterior.engine), highlight=False, soft_wrap=True)
     terminal.print_diagnosis(console, posterior)
     terminal.print_exact_verdicts(console, posterior)

@@ -1,7 +1,8 @@
 """The density in other coordinates, in which functions that data determine do not move with how they vary.
 
 Whitened weights v of a function have f = L(η) v at its inducing inputs, L Lᵀ = s² R(Z, Z): where data determine f,
-weights and log-SD s or length scale ℓ lie on a curved ridge. So samplers move c = L(η₀)⁻¹ f, with η₀ the medians of s and ℓ:
+weights and log-SD s or length scale ℓ lie on a curved ridge. So samplers move c = L(η₀)⁻¹ f, with η₀ the medians of
+s and ℓ:
 
     v = L(η)⁻¹ L(η₀) c,    log |∂v/∂c| = log det L(η₀) − log det L(η)
 

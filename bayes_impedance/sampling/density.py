@@ -43,7 +43,7 @@ FEW = 50
 
 
 class SampledDensity(TiltedDensity):
-    """A log density that samplers climb and walk on, over coordinates that are near standard normal before any force."""
+    """A log density that samplers climb and walk on, over coordinates of about unit size before any force."""
 
     @property
     def size(self) -> int:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +24,7 @@ from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.priors import build_force_model
 from bayes_impedance.sampling.centred import CentredDensity
 from bayes_impedance.sampling.chains import sample_nuts
+from bayes_impedance.sampling.checkpoint import Checkpoint
 from bayes_impedance.sampling.dataset import names_of_coordinates
 from bayes_impedance.sampling.density import JointDensity
 from bayes_impedance.sampling.diagnostics import diagnose
@@ -87,7 +91,8 @@ def sample_posterior(
     model = build_force_model(config, feature_map)
     inducing = problem.inducing or choose_inducing(config, model, given)
     density = JointDensity(config, model, given, inducing)
-    draws = draw(density, config.training, settings, hook, checkpoint)
+    kept = None if checkpoint is None else Checkpoint(checkpoint, _fingerprint(problem, inducing))
+    draws = draw(density, config.training, settings, hook, kept)
     standard = draws.standard.reshape(-1, density.size)
     latents = draw_latents(density, standard, target, settings.seed, _drawing(hook))
     diagnosis = diagnose(draws, names_of_coordinates(density.parameters, log.axes), settings.max_tree_depth)
@@ -100,7 +105,7 @@ def draw(
     training: TrainingConfig,
     settings: SamplingConfig,
     hook: Hook | None = None,
-    checkpoint: Path | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> Draws:
     """Draws of the density by the method that is set, from the mode of greatest evidence on.
 
@@ -120,6 +125,21 @@ def draw(
     else:
         found = sample_nuts(centred, start, settings, _sampling(hook), checkpoint)
     return replace(found, standard=centred.all_standard(found.standard))
+
+
+def _fingerprint(problem: Problem, inducing: tuple[Tensor | None, ...]) -> dict[str, str]:
+    """What draws depend on beside the settings of sampling."""
+    described = problem.config.model_dump(mode="json", exclude={"sampling", "baseline", "log"})
+    digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
+    for inputs in inducing:
+        digest.update(b"" if inputs is None else inputs.numpy().tobytes())
+    return {
+        "model": digest.hexdigest()[:16],
+        "recordings": problem.evidence.fingerprint()[:16],
+        "bayes_impedance": version("bayes-impedance"),
+        "torch": version("torch"),
+        "pyro": version("pyro-ppl"),
+    }
 
 
 def _check_forces(problem: Problem) -> None:

@@ -170,7 +170,7 @@ def _moments(i, a, record, e, row, work):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _smoothed(plan, t, i, record, adjoint, information, mean, covariance):  # type: ignore[no-untyped-def]
-    """m + P μ and, unless `covariance` is empty, P − P Λ P of the states of the blocks at sample t, block by block."""
+    """m + P μ and P − P Λ P (unless that is empty) of the states of the blocks at sample t, block after block."""
     axes, size, width = record.g.shape[1], adjoint.shape[0], mean.shape[0]
     # Rows of P: those of P∞ are its product with unit vectors.
     rows, index = np.zeros((width, size)), np.zeros(width, dtype=np.int64)
