@@ -105,7 +105,7 @@ def _one_by_one(task: Task, progress: Progress) -> Fates:
 
 def _side_by_side(task: Task, progress: Progress, workers: int) -> Fates:
     fates = Fates()
-    content = _by_value(task)
+    content = by_value(task)
     waiting = list(range(task.settings.chains))
     with _processes() as running:
         while waiting or running:
@@ -210,7 +210,8 @@ class _ByValue(ForkingPickler):
         self.dispatch_table = copyreg.dispatch_table
 
 
-def _by_value(task: Task) -> bytes:
+def by_value(task: Task) -> bytes:
+    """A task for a process that shares nothing with this one."""
     file = io.BytesIO()
     _ByValue(file).dump(task)
     return file.getvalue()

@@ -1,6 +1,7 @@
 """Chains side by side: the same draws in any number of processes, killed, interrupted or not; deaths are told."""
 
 import multiprocessing
+import multiprocessing.reduction
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,10 +9,17 @@ import numpy as np
 import pytest
 from toys import Broken, Deadly, Gaussian, Mortal, start
 
-from bayes_impedance.config import SamplingConfig
+from bayes_impedance.config import SamplingConfig, load_config
 from bayes_impedance.errors import JournalWarning, OutputError, SamplingError
-from bayes_impedance.sampling.chains import sample_nuts
+from bayes_impedance.features import FeatureMap
+from bayes_impedance.impedance_functions.function import choose_inducing
+from bayes_impedance.priors import build_force_model
+from bayes_impedance.sampling.chains import by_value, sample_nuts
 from bayes_impedance.sampling.checkpoint import Checkpoint
+from bayes_impedance.sampling.density import JointDensity
+from bayes_impedance.sampling.task import Task, fingerprint
+from bayes_impedance.simulation.generative import draw_force, repeated_motion
+from bayes_impedance.trajectory_mean import TrajectoryMean
 
 SETTINGS = SamplingConfig(chains=2, warmup=60, draws=40)
 
@@ -49,7 +57,7 @@ def test_in_processes_as_in_this_one(expected):
 def test_killed_and_resumed_gives_the_same_bits(expected, checkpoint):
     # In the middle of an iteration, first of the warm-up and then of what comes after it.
     done = []
-    for last in (200, 600):
+    for last in (200, 900):
         with pytest.raises(
             SamplingError, match="chain 1 was ended by signal 9.*too little memory is the usual"
         ):
@@ -62,8 +70,6 @@ def test_killed_and_resumed_gives_the_same_bits(expected, checkpoint):
 
 
 def state_of(checkpoint, chain):
-    from bayes_impedance.sampling.task import fingerprint
-
     return replace(checkpoint, fingerprint={**checkpoint.fingerprint, **fingerprint(SETTINGS)}).read(chain)
 
 
@@ -121,6 +127,28 @@ def test_goes_on_where_nothing_can_be_kept(expected, tmp_path):
     with pytest.raises(OutputError, match="expected a checkpoint that can be read"):
         sample_nuts(Gaussian(), start(), SETTINGS, checkpoint=nowhere)
     missing = Checkpoint(Path("/proc/nowhere"), {}, every=0.0)
-    with pytest.warns(JournalWarning, match="sampling goes on, but if it is killed, chain 1 is not kept"):
+    with pytest.warns(JournalWarning, match="sampling goes on, but if it is killed, chain [12] is not kept"):
         draws = sample_nuts(Gaussian(), start(), SETTINGS, checkpoint=missing, processes=1)
     assert_same(draws, expected)
+
+
+@pytest.mark.parametrize("kernel", ["matern52", "squared_exponential", "rational_quadratic"])
+def test_a_density_travels_to_other_processes(kernel):
+    about = [
+        f"model.desired_trajectory.kernel={kernel}",
+        "log.axes=[x]",
+        "engine.impedance=map",
+        "engine.inducing=3",
+    ]
+    config = load_config("phase", about)
+    log = draw_force(config, repeated_motion(2, 2.0, 10.0, axes=("x",)), seed=0)
+    layout = FeatureMap(config, ("x",))
+    features = layout(log, TrajectoryMean.from_training(config.model.desired_trajectory, log), observed=True)
+    model = build_force_model(config, layout)
+    density = JointDensity(config, model, features, choose_inducing(config, model, features))
+    task = Task(density, start(density.size), SETTINGS, None)
+    arrived = multiprocessing.reduction.ForkingPickler.loads(by_value(task))
+    point = 0.1 * np.random.default_rng(0).standard_normal(density.size)
+    (value, gradient), (other, other_gradient) = density.joint(point), arrived.density.joint(point)
+    assert value == other and (gradient == other_gradient).all()
+    assert arrived.settings == SETTINGS

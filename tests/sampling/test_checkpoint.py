@@ -84,13 +84,10 @@ def test_damaged_anywhere(checkpoint):
         damages.append(bytes(flipped))
     for damage in damages:
         path.write_bytes(damage)
-        try:
-            state = checkpoint.read(0)
-        except OutputError as error:
-            assert "expected the checkpoint of a chain, found a damaged file; delete it" in str(error)
-        else:
-            # Spaces that pad the header say nothing.
-            assert all((state[name] == values).all() for name, values in STATE.items())
+        with pytest.raises(
+            OutputError, match="expected the checkpoint of a chain, found a damaged file; delete it"
+        ):
+            checkpoint.read(0)
 
 
 def test_unreadable(checkpoint):
