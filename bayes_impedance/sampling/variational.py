@@ -169,6 +169,6 @@ def _unsettled(elbo: Array) -> str | None:
     if error > SCATTER:
         return (
             f"the ELBO scatters by {last.std(ddof=1):.2g} nats from step to step, too much to say whether the fit "
-            f"of the guide has settled; set sampling.steps to {2 * len(elbo)}, if that does not help sampling.method=nuts"
+            f"of the guide has settled; set sampling.steps to {2 * len(elbo)}, or use sampling.method=nuts"
         )
     return None

@@ -128,7 +128,7 @@ def test_progress_tells_the_elbo():
         (np.zeros(7), "7 steps of a fit are too few to say whether it settled; set sampling.steps to 1000 or more"),
         (
             100.0 * np.random.default_rng(0).standard_normal(2000),
-            "nats from step to step, too much to say whether the fit of the guide has settled; set sampling.steps to 4000",
+            "nats from step to step, too much to say whether the fit of the guide has settled; set sampling.steps to",
         ),
     ],
 )  # fmt: skip
