@@ -188,8 +188,8 @@ def _propose(
     needed = PROPOSALS * ENOUGH * wanted / first.effective
     more = min(int(needed), ROUNDS * wanted) - PROPOSALS
     if first.pareto_k > TRUSTED_K:
-        # One tail of a thousand is known to .15 only, and where it is heavy more proposals cost time for nothing.
-        more = PROPOSALS
+        # The k of so few is known to .15 only; where the tail is heavy more than this cost time for nothing.
+        more = 2 * PROPOSALS
     if more <= 0:
         return steps, first
     steps = np.concatenate([steps, proposals(more, density.size, generator)])

@@ -29,7 +29,7 @@ from bayes_impedance.sampling.start import Start
 Array = NDArray[np.float64]
 
 #: First rate of Adam, in SDs of Laplace's approximation, and the share of it at the last step.
-RATE, LAST = 0.03, 0.02
+RATE, LAST = 0.03, 0.1
 #: Columns of a low-rank guide begin this small, next to a diagonal of one: at zero their gradient is, too.
 SMALL = 0.1
 #: A rise of the ELBO that is too small to count [nats], one that its own noise explains, in standard errors, and noise
@@ -168,7 +168,7 @@ def _unsettled(elbo: Array) -> str | None:
         )
     if error > SCATTER:
         return (
-            f"the ELBO scatters by {last.std(ddof=1):.2g} nats from step to step, too much to say whether the fit of "
-            "the guide has settled: the posterior is far from Gaussian; use sampling.method=nuts"
+            f"the ELBO scatters by {last.std(ddof=1):.2g} nats from step to step, too much to say whether the fit "
+            f"of the guide has settled; set sampling.steps to {2 * len(elbo)}, or use sampling.method=nuts"
         )
     return None

@@ -7,7 +7,7 @@ from bayes_impedance.sampling.density import JointDensity
 from bayes_impedance.sampling.start import Start, find_start
 from tests.impedance_functions.problems import KNOWN_VARIATION, MARKOV, small_problem
 
-ONE_AXIS = {"axes": ("x",), "repetitions": 3, "rate": 8.0}
+ONE_AXIS = {"axes": ("x",), "repetitions": 3, "rate": 16.0}
 
 
 @cache

@@ -69,7 +69,7 @@ def test_an_approximation_of_half_the_sd_is_found_out():
     # It stays what it was, so that nobody takes half-corrected draws for either.
     sd = 0.5 * np.sqrt(np.diag(COVARIANCE))
     assert np.abs(draws.standard[0].std(0) / sd - 1.0).max() < 5.0 / np.sqrt(2 * effective(draws))
-    assert density.evaluations == 2 * PROPOSALS
+    assert density.evaluations == 3 * PROPOSALS
 
 
 def test_a_wide_approximation_is_corrected():

