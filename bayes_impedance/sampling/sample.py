@@ -22,7 +22,6 @@ from bayes_impedance.impedance_functions.threads import one_thread
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER
 from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.priors import build_force_model
-from bayes_impedance.sampling.centred import CentredDensity
 from bayes_impedance.sampling.chains import sample_nuts
 from bayes_impedance.sampling.checkpoint import Checkpoint
 from bayes_impedance.sampling.dataset import names_of_coordinates
@@ -36,6 +35,7 @@ from bayes_impedance.sampling.parameters import QUANTITIES
 from bayes_impedance.sampling.places import choose_places
 from bayes_impedance.sampling.start import find_start
 from bayes_impedance.sampling.support import Evidence, exact_off_diagonals, exact_verdicts
+from bayes_impedance.sampling.transport import TransportedDensity
 from bayes_impedance.sampling.variational import svi_draws
 from bayes_impedance.trajectory_mean import TrajectoryMean
 
@@ -109,22 +109,22 @@ def draw(
 ) -> Draws:
     """Draws of the density by the method that is set, from the mode of greatest evidence on.
 
-    Samplers move in the coordinates of `CentredDensity`; `lp` is the density of those.
+    Samplers move in the coordinates of `TransportedDensity`; `lp` is the density of those.
 
     Raises:
         NotPositiveDefiniteError: the density is not finite about its mode.
         SamplingError: every chain died.
         OutputError: the checkpoint is of another posterior, or cannot be written.
     """
-    centred = CentredDensity(density)
-    start = find_start(centred, training, progress=_climbing(hook))
+    transported = TransportedDensity(density)
+    start = find_start(transported, training, progress=_climbing(hook))
     if settings.method == "svi":
-        found = svi_draws(centred, start, settings, _sampling(hook))
+        found = svi_draws(transported, start, settings, _sampling(hook))
     elif settings.method == "laplace":
-        found = laplace_draws(centred, start, settings, _sampling(hook))
+        found = laplace_draws(transported, start, settings, _sampling(hook))
     else:
-        found = sample_nuts(centred, start, settings, _sampling(hook), checkpoint)
-    return replace(found, standard=centred.all_standard(found.standard))
+        found = sample_nuts(transported, start, settings, _sampling(hook), checkpoint)
+    return replace(found, standard=transported.all_standard(found.standard))
 
 
 def _fingerprint(problem: Problem, inducing: tuple[Tensor | None, ...]) -> dict[str, str]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bayes_impedance.config import TrainingConfig
 from bayes_impedance.impedance_functions import laplace
 from bayes_impedance.impedance_functions.fit import take_turns
-from bayes_impedance.sampling.density import SampledDensity
+from bayes_impedance.sampling.transport import TransportedDensity
 
 Array = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ class Start:
 
 
 def find_start(
-    density: SampledDensity,
+    density: TransportedDensity,
     training: TrainingConfig,
     near: Array | None = None,
     progress: Callable[[int, float], None] | None = None,
@@ -57,6 +57,7 @@ def find_start(
         training.max_iterations,
         training.gradient_tolerance,
         progress,
+        vary=density.settle,
         turns=TURNS,
         settled=SETTLED,
     )
