@@ -175,7 +175,9 @@ def _evidence(drawn: DrawnPosterior) -> Evidence:
         posterior[latent] = _by_place(drawn.matrices(latent))
         prior[latent] = before[latent]
         weights = values[f"{QUANTITIES[j]}_weights"]
-        log_prior[latent] = -0.5 * np.square(weights.reshape(len(weights), -1)).sum(axis=1)
+        # The first weight of an entry is that of its level; the first entries are those of the diagonal.
+        levels = weights[..., : len(drawn.axes), 0]
+        log_prior[latent] = -0.5 * np.square(levels).sum(axis=1)
     sd = values.get("desired_trajectory_sd")
     return Evidence(posterior, prior, None if sd is None else sd[..., 0], log_prior)
 

@@ -36,7 +36,7 @@ FEWEST = 100
 @dataclass(frozen=True)
 class ExactVerdict:
     """A `Verdict` from draws, with the correlation of log w with the logarithm of the SD of x_d, NaN where that is
-    fixed, and with how much the posterior moves with the power of its prior.
+    fixed, and with how much the posterior moves with the power of the prior of its level.
     """  # fmt: skip
 
     verdict: Verdict
@@ -49,7 +49,7 @@ class Evidence:
     """What verdicts are made of.
 
     `impedance` and `prior`: draws `(draws, places, axes, axes)` of K, D, M; `trajectory_sd` `(draws, axes)` [m], None
-    where it is fixed; `log_prior` `(draws,)` of the weights of each of K, D, M [nats].
+    where it is fixed; `log_prior` `(draws, axes)` of the levels of each of K, D, M [nats].
     """
 
     impedance: Mapping[Latent, Array]
@@ -84,7 +84,7 @@ def _verdict(evidence: Evidence, latent: Latent, a: int, axis: str, confounded: 
     correlation = float("nan")
     if evidence.trajectory_sd is not None and not is_fixed:
         correlation = float(np.corrcoef(average, np.log(evidence.trajectory_sd[:, a]))[0, 1])
-    sensitivity = 0.0 if is_fixed else _sensitivity(average, evidence.log_prior[latent])
+    sensitivity = 0.0 if is_fixed else _sensitivity(average, evidence.log_prior[latent][:, a])
     if confounded is None and abs(correlation) >= CONFOUNDED:
         confounded = (
             f"it goes with the SD of the desired trajectory (correlation {correlation:.2f}), and only their product is "
