@@ -1,7 +1,7 @@
 """Whether draws can be trusted.
 
 Rank-normalised split R-hat, bulk and tail effective sample size (ESS) after Vehtari, Gelman, Simpson, Carpenter and
-Bürkner 2021 (doi 10.1214/20-BA1221); E-BFMI after Betancourt 2016 (arXiv:1604.00695); Pareto k: see `importance`.
+Bürkner 2021 (doi 10.1214/20-BA1221); E-BFMI after Betancourt 2016 (arXiv:1604.00695); Pareto k: see `weigh`.
 """
 
 from __future__ import annotations

@@ -14,8 +14,6 @@ from bayes_impedance.errors import NotPositiveDefiniteError
 from bayes_impedance.sampling.program import pyro_program
 from tests.sampling.small_densities import joint_density, laplace
 
-VARIED = ("model.stiffness.log_sd.fixed=false",)
-
 
 @pytest.fixture(autouse=True)
 def apart():
@@ -92,12 +90,28 @@ def test_nuts_of_pyro_runs_on_it():
         assert torch.isfinite(draws[parameter.name]).all()
 
 
-def test_a_failed_factorisation_is_not_a_number(monkeypatch):
+@pytest.mark.parametrize("failure", ["no factor", "NaN"])
+def test_a_failed_factorisation_is_a_divergence_and_no_crash(monkeypatch, failure):
+    """Of a mass above its median, in steps of NUTS."""
     density = joint_density()
+    likelihood = density.log_likelihood
+    failed = 0
 
-    def fails(_):
+    def fails(values):
+        nonlocal failed
+        if values["mass_weights"].item() < 0.0:
+            return likelihood(values)
+        failed += 1
+        if failure == "NaN":
+            return torch.full((), torch.nan, dtype=torch.float64)
         raise NotPositiveDefiniteError("no factor")
 
     monkeypatch.setattr(density, "log_likelihood", fails)
-    trace = poutine.trace(pyro_program(density)).get_trace()
-    assert torch.isnan(trace.nodes["force"]["fn"].log_factor)
+    values = density.values(torch.from_numpy(laplace().point))
+    outside = {**values, "mass_weights": torch.ones_like(values["mass_weights"])}
+    traced = poutine.trace(poutine.condition(pyro_program(density), outside)).get_trace()
+    assert torch.isneginf(traced.nodes["force"]["fn"].log_factor)
+    kernel = NUTS(pyro_program(density), max_tree_depth=3)
+    mcmc = MCMC(kernel, num_samples=5, warmup_steps=10, disable_progbar=True)
+    mcmc.run()
+    assert failed > 1 and bool((mcmc.get_samples()["mass_weights"] < 0.0).all())
