@@ -301,7 +301,6 @@ CONFINED = {
         "sampling.program",
         "sampling.exceptions",
         "sampling.kernel",
-        "sampling.nuts",
         "sampling.task",
         "sampling.variational",
     },

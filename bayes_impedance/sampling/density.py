@@ -58,6 +58,13 @@ class SampledDensity(TiltedDensity):
             NotPositiveDefiniteError: it is not finite there.
         """
 
+    def settle(self, point: Array, precision: Array) -> tuple[Array, float]:
+        """Take up what is known about a mode, its `precision` `(size, size)`; the same place, and how far it moved.
+
+        Coordinates that know nothing of modes stay as they are.
+        """
+        return point, 0.0
+
     def joint(self, point: Array) -> tuple[float, Array]:
         """`log_density` and its gradient.
 

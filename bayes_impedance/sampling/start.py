@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bayes_impedance.config import TrainingConfig
 from bayes_impedance.impedance_functions import laplace
 from bayes_impedance.impedance_functions.fit import take_turns
-from bayes_impedance.sampling.transport import TransportedDensity
+from bayes_impedance.sampling.density import SampledDensity
 
 Array = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ class Start:
 
 
 def find_start(
-    density: TransportedDensity,
+    density: SampledDensity,
     training: TrainingConfig,
     near: Array | None = None,
     progress: Callable[[int, float], None] | None = None,
