@@ -26,6 +26,11 @@ CASES = {
 }
 
 
+def layout_of(density):
+    middle = torch.zeros(density.size, dtype=torch.float64)
+    return density.processes(density.values(middle)).layout
+
+
 def density_of(case, **settings):
     overrides, axes, engine = CASES[case]
     settings = {"repetitions": 2, "rate": 7.0, "groups": 2, **settings}
@@ -57,9 +62,7 @@ def test_impedance_is_that_of_the_draw_and_force_has_noise_of_its_own(case):
     axes, groups, m = target.inputs.shape[:3]
     assert set(drawn) == {*LATENTS, *IMPEDANCE_ORDER}
     errors = torch.cat(
-        density.processes(density.values(torch.zeros(density.size, dtype=torch.float64))).layout.errors(
-            target.inputs, order=2
-        ),
+        layout_of(density).errors(target.inputs, order=2),
         dim=-1,
     )
     hand = (target.trajectory_mean - errors).numpy()
@@ -127,9 +130,7 @@ def test_impedance_elsewhere_is_that_of_the_functions():
     density = density_of("markov, coupled, length scales")
     features = density.features
     inputs = features.inputs.clone()
-    phase = inputs[
-        ..., density.processes(density.values(torch.zeros(density.size, dtype=torch.float64))).layout.theta[0]
-    ].clone()
+    phase = inputs[..., layout_of(density).theta[0]].clone()
     same = [column for column in range(inputs.shape[-1]) if torch.equal(inputs[..., column], phase)]
     assert len(same) == 2
     inputs[..., same] += 0.01
