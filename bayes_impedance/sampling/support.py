@@ -32,6 +32,7 @@ SENSITIVE = 0.05
 POWERS = (0.8, 1.25)
 #: The fewest draws that say anything of a variance, and of what a prior does.
 FEWEST = 100
+TOO_FEW = "{} draws are too few to tell what the data said, set sampling.draws higher"
 
 
 @dataclass(frozen=True)
@@ -69,8 +70,8 @@ def exact_verdicts(
     """
     confounded = confounding(config, repetitions, perturbed)
     count = len(evidence.impedance[Latent.STIFFNESS])
-    if confounded is None and count < FEWEST:
-        confounded = f"{count} draws are too few to tell; set sampling.draws higher"
+    if count < FEWEST:
+        confounded = TOO_FEW.format(count)
     return [
         _verdict(evidence, latent, a, axis, confounded)
         for latent in IMPEDANCE_ORDER
@@ -99,6 +100,8 @@ def _verdict(evidence: Evidence, latent: Latent, a: int, axis: str, confounded: 
     support = classify(contraction) if confounded is None else Support.PRIOR_ONLY
     bands = _bands(draws, prior)
     sentence = verdict_sentence(latent, axis, contraction, support, confounded, is_fixed)
+    if len(draws) < FEWEST and not is_fixed:
+        sentence = f"{latent.value} {axis}{axis}: {support.value}; {confounded}."
     if sensitivity > SENSITIVE and support is not Support.PRIOR_ONLY:
         sentence += (
             f" It moves with its prior (sensitivity {rounded(sensitivity)}): look at another prior, too."
