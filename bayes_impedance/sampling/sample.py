@@ -133,15 +133,14 @@ def draw(
 def _fingerprint(problem: Problem, inducing: tuple[Tensor | None, ...]) -> dict[str, str]:
     """What draws depend on beside the settings of sampling."""
     described = problem.config.model_dump(mode="json", exclude={"sampling", "baseline", "log"})
-    digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
-    for inputs in inducing:
-        digest.update(b"" if inputs is None else inputs.numpy().tobytes())
-    # A model that was trained on another log has another prior mean of x_d.
-    for trial in problem.evidence.trials:
-        digest.update(problem.mean.derivatives(trial).tobytes())
+    means = [problem.mean.derivatives(trial).tobytes() for trial in problem.evidence.trials]
+    inputs = [b"" if inputs is None else inputs.numpy().tobytes() for inputs in inducing]
     return {
-        "model": digest.hexdigest()[:16],
+        "model": hashlib.sha256(json.dumps(described, sort_keys=True).encode()).hexdigest()[:16],
         "recordings": problem.evidence.fingerprint()[:16],
+        # Those of a model that was trained on another log are others.
+        "choice of inducing inputs": hashlib.sha256(b"".join(inputs)).hexdigest()[:16],
+        "prior mean of the desired trajectory": hashlib.sha256(b"".join(means)).hexdigest()[:16],
         "bayes_impedance": version("bayes-impedance"),
         "torch": version("torch"),
         "pyro": version("pyro-ppl"),

@@ -145,6 +145,17 @@ def _sensitivity(values: Array, log_prior: Array) -> float:
     """How much the distribution of `values` `(draws,)` moves with the power of a prior, per doubling of it."""
     if np.ptp(log_prior) == 0.0 or np.ptp(values) == 0.0:
         return float("nan")
-    lower, upper = (np.exp(array_stats.power_scale_lw(log_prior, alpha=power)) for power in POWERS)
-    parts = [part[None] for part in (values, lower / lower.sum(), upper / upper.sum())]
+    lower, upper = (_weights(log_prior, power) for power in POWERS)
+    parts = [part[None] for part in (values, lower, upper)]
     return float(array_stats.power_scale_sense(*parts, *POWERS))
+
+
+def _weights(log_prior: Array, power: float) -> Array:
+    """Weights of draws under a prior raised to a power, their tail smoothed."""
+    with np.errstate(all="ignore"):
+        log_weights = array_stats.power_scale_lw(log_prior, alpha=power)
+    if not np.isfinite(log_weights).all():
+        # Draws of an approximation come more than once, and ties fit no tail.
+        log_weights = (power - 1.0) * log_prior
+    weights: Array = np.exp(log_weights - log_weights.max())
+    return weights / weights.sum()

@@ -88,9 +88,13 @@ def test_coordinates_say_where_a_place_is():
 
 def test_components_of_a_length_scale_are_variables_of_their_own():
     data = as_tree(drawn("position"))["posterior"]
-    names = {name for name in data.data_vars if "length_scale" in name}
-    assert "desired_trajectory_length_scale_position_x" in names
-    assert all(data[name].dims in ((*FIRST, "axis"), FIRST) and data[name].attrs["units"] == "m" for name in names)
+    for axis in ("x", "y"):
+        for name, unit in (("desired_trajectory", "m"), ("residual", "m")):
+            one = data[f"{name}_length_scale_position_{axis}"]
+            assert (one.dims, one.attrs["units"]) == ((*FIRST, "axis"), unit)
+    assert data["residual_length_scale_velocity_y"].attrs["units"] == "m/s"
+    # One of two axes that couple is that of both.
+    assert as_tree(drawn("groups"))["posterior"]["stiffness_length_scale"].dims == FIRST
 
 
 @pytest.mark.parametrize("case", CASES)
