@@ -126,18 +126,18 @@ def draw_force(
         rows = slice(counts[trial.group], counts[trial.group] + len(trial.time))
         counts[trial.group] = rows.stop
         parts = [part[:, rows] for part in drawn[trial.group]]
-        trials.append(_with_force(trial, motion.axes, *parts, answer=answers[trial.group]))
+        trials.append(_with_force(trial, motion.axes, answers[trial.group], *parts))
     return PreparedLog(motion.axes, tuple(trials))
 
 
 def _with_force(
     trial: PreparedTrial,
     axes: tuple[str, ...],
+    answer: Array | None,
     desired: Array,
     impedance: Array,
     residual: Array,
     noise: Array,
-    answer: Array | None,
 ) -> PreparedTrial:
     """`trial` with what was drawn for it, as `draw_group` gives it."""
     hand = np.stack([trial.position.T, trial.velocity.T, trial.acceleration.T], axis=-1)

@@ -43,7 +43,7 @@ def draw_recording(density: JointDensity, motion: PreparedLog, standard: Array, 
 
 
 def force_model_at(config: Config, axes: tuple[str, ...], values: Mapping[str, Tensor]) -> ForceModel:
-    """The force model with hyperparameters of desired trajectory, residual force and noise from the `values` of sites."""
+    """The force model with what `values` of sites say of desired trajectory, residual force and noise."""
     model = build_force_model(config, FeatureMap(config, axes))
     with torch.no_grad():
         for entry in beside_impedance(model):
