@@ -61,9 +61,7 @@ def curvature(density, point: np.ndarray) -> np.ndarray:
     """Of the negative log density, from central differences of it."""
     step, unit = 1e-3, np.eye(len(point))
     pairs = [(i, j) for i in range(len(point)) for j in range(len(point))]
-    corners = [
-        point + step * (s * unit[i] + t * unit[j]) for i, j in pairs for s in (1, -1) for t in (1, -1)
-    ]
+    corners = [point + step * (s * unit[i] + t * unit[j]) for i, j in pairs for s in (1, -1) for t in (1, -1)]
     values = at_once(density.log_density, np.array(corners)).numpy().reshape(-1, 4)
     second = (values @ np.array([1.0, -1.0, -1.0, 1.0])) / (4.0 * step**2)
     return -second.reshape(len(point), len(point))
@@ -79,9 +77,9 @@ def marginal_latents(density, standard, target, seed):
         posterior = density.engine.posterior(density.processes(values), impedance, target, there)
         return torch.stack(posterior[Latent.DESIRED_POSITION])
 
-    mean, variance = at_once(moments, standard).unbind(1)
-    generator = np.random.default_rng(seed)
-    return {Latent.DESIRED_POSITION: (mean + variance.sqrt() * generator.standard_normal(mean.shape)).numpy()}
+    mean, variance = at_once(moments, standard).numpy().swapaxes(0, 1)
+    steps = np.random.default_rng(seed).standard_normal(mean.shape)
+    return {Latent.DESIRED_POSITION: mean + np.sqrt(variance) * steps}
 
 
 def at_once(function, points: np.ndarray) -> torch.Tensor:
