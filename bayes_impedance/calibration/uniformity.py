@@ -60,14 +60,19 @@ def bins_for(count: int, thinned: int) -> int:
         (20, 5)
 
     Raises:
-        ConfigurationError: there are too few ranks for two bins.
+        ConfigurationError: there are too few ranks, or their number has no divisor.
     """
-    most = min(MOST_BINS, count // EXPECTED)
-    fitting = [bins for bins in range(2, most + 1) if (thinned + 1) % bins == 0]
-    if count < FEWEST or not fitting:
+    if count < FEWEST:
         raise ConfigurationError(
             f"--draws: expected at least {FEWEST} draws with a posterior, for a test of uniform ranks, found {count}; "
             "take more"
+        )
+    most = min(MOST_BINS, count // EXPECTED)
+    fitting = [bins for bins in range(2, most + 1) if (thinned + 1) % bins == 0]
+    if not fitting:
+        raise ConfigurationError(
+            f"--thinned: expected ranks that can be put into 2 to {most} equal bins, got {thinned + 1} of them; take "
+            "one less than a multiple of 10, such as 99"
         )
     return fitting[-1]
 

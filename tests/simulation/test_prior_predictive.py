@@ -69,7 +69,7 @@ def motion() -> PreparedLog:
 def test_forces_scatter_as_the_likelihood_says(name: str) -> None:
     # 2 (log p at the mean − log p) ~ χ² with as many degrees of freedom as there are forces.
     config = CONFIGURATIONS[name]
-    problem, draws = Problem(config, motion()), 80
+    problem, draws = Problem(config, motion()), 50
     point = 0.7 * np.random.default_rng(3).standard_normal(problem.prior.size)
     with torch.no_grad():
         values = problem.prior.values(torch.from_numpy(point))
@@ -92,7 +92,7 @@ def test_forces_scatter_as_the_likelihood_says(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["phase", "coupled"])
 def test_moments_are_those_of_the_dense_engine(name: str) -> None:
-    problem, draws = Problem(CONFIGURATIONS[name], motion().select([0, 1])), 200
+    problem, draws = Problem(CONFIGURATIONS[name], motion().select([0, 1])), 120
     point = 0.7 * np.random.default_rng(4).standard_normal(problem.prior.size)
     with torch.no_grad():
         values = problem.prior.values(torch.from_numpy(point))
