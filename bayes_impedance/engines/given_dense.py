@@ -8,11 +8,13 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from bayes_impedance.engines.gaussian import draw_gaussian
 from bayes_impedance.engines.given_impedance import (
     LATENTS,
     MeanAndVariance,
     Processes,
     as_read,
+    drawn_latents,
     mean_force,
     prior_mean,
 )
@@ -21,6 +23,9 @@ from bayes_impedance.features import Features
 from bayes_impedance.kernels.derivative import Table, derivative_table
 from bayes_impedance.kernels.impedance import TRAJECTORY_ORDER, Latent, same_label
 from bayes_impedance.kernels.warped import evaluate
+
+#: What is drawn; forces follow.
+DRAWN = (*TRAJECTORY_ORDER, Latent.RESIDUAL_FORCE)
 
 
 class DenseGivenImpedance:
@@ -68,6 +73,55 @@ class DenseGivenImpedance:
                 location = shift + prior_mean(processes.layout, target, target_impedance, latent)
                 result[latent] = (location, (own - known).clamp_min(0.0))
         return result
+
+    def draw(
+        self,
+        processes: Processes,
+        impedance: Tensor,
+        target: Features,
+        target_impedance: Tensor,
+        generator: torch.Generator,
+    ) -> Mapping[Latent, Tensor]:
+        """See `ConditionalEngine`; costs the cube of all that is drawn.
+
+        Raises:
+            NotPositiveDefiniteError: no Cholesky factor at this jitter.
+        """
+        impedance, target_impedance = (
+            as_read(impedance, self.coupled),
+            as_read(target_impedance, self.coupled),
+        )
+        with torch.no_grad():
+            cholesky, misfit = self._factor(processes, impedance)
+            # f, ḟ, f̈ and ũ; each has the samples of all axes next to each other where these couple.
+            cross = torch.cat(
+                [self._cross(processes, impedance, target, target_impedance, latent) for latent in DRAWN],
+                dim=-1,
+            )
+            white = torch.linalg.solve_triangular(
+                cholesky, torch.cat([cross, misfit.unsqueeze(-1)], dim=-1), upper=False
+            )
+            known, shift = white[..., :-1], white[..., :-1].mT @ white[..., -1:]
+            covariance = self._prior_covariance(processes, target) - known.mT @ known
+            drawn = shift[..., 0] + draw_gaussian(covariance, generator)
+            parts = [self._per_axis(part, target.inputs.shape[:3]) for part in drawn.chunk(len(DRAWN), -1)]
+        deviation = torch.stack(parts[:3], dim=-1)
+        return drawn_latents(processes.layout, target, target_impedance, deviation, parts[3])
+
+    def _prior_covariance(self, processes: Processes, target: Features) -> Tensor:
+        """Covariance of the quantities of `DRAWN` at the samples of `target`, in the order of `_cross`."""
+        x = target.inputs
+        table, residual = _trajectory(processes, x, x), _residual(processes, x, x)
+        rows = [torch.cat([*row, torch.zeros_like(residual)], dim=-1) for row in table]
+        rows.append(torch.cat([*(torch.zeros_like(residual) for _ in table), residual], dim=-1))
+        own = torch.cat(rows, dim=-2)
+        if not self.coupled:
+            return own
+        axes, groups, m = x.shape[:3]
+        parts = own.reshape(axes, groups, len(DRAWN), m, len(DRAWN), m)
+        eye = torch.eye(axes, dtype=own.dtype)
+        size = len(DRAWN) * axes * m
+        return torch.einsum("agimjk,ac->giamjck", parts, eye).reshape(1, groups, size, size)
 
     def _count(self) -> Tensor:
         counts = self.features.counts

@@ -80,6 +80,20 @@ class ConditionalEngine(Protocol):
         in their order.
         """
 
+    def draw(
+        self,
+        processes: Processes,
+        impedance: Tensor,
+        target: Features,
+        target_impedance: Tensor,
+        generator: torch.Generator,
+    ) -> Mapping[Latent, Tensor]:
+        """One draw of all of `LATENTS` together given the forces, at the samples of `target`, `(axes, groups, m)` each.
+
+        x_d is one function, whose derivatives are those drawn, and FORCE = Σ_j W_j e^{(j)} + ũ of the same draw.
+        Conventions are those of `posterior`; padding of `target` has the prior mean.
+        """
+
 
 def residual_terms(kernel: Kernel | None) -> tuple[Stationary, ...]:
     """The independent terms of a residual's covariance."""
@@ -104,6 +118,26 @@ def prior_mean(layout: InputLayout, target: Features, impedance: Tensor, latent:
     if latent is Latent.RESIDUAL_FORCE:
         return target.inputs.new_zeros(target.inputs.shape[:-1])
     return target.trajectory_mean[..., TRAJECTORY_ORDER[latent]]
+
+
+def drawn_latents(
+    layout: InputLayout, target: Features, impedance: Tensor, deviation: Tensor, residual: Tensor
+) -> dict[Latent, Tensor]:
+    """All of `LATENTS`, `(axes, groups, m)` each, of drawn f, ḟ, f̈ `(axes, groups, m, 3)` and ũ `(axes, groups, m)`.
+
+    `impedance` as the engine reads it; at padding the prior mean stands in for the draw.
+    """
+    if target.valid is not None:
+        deviation = torch.where(target.valid.unsqueeze(-1), deviation, 0.0)
+        residual = torch.where(target.valid, residual, 0.0)
+    force = mean_force(layout, target, impedance) + residual
+    force = force + torch.einsum("gnjab,bgnj->agn", impedance, deviation)
+    desired = (target.trajectory_mean + deviation).unbind(-1)
+    return {
+        Latent.FORCE: force,
+        **{latent: desired[order] for latent, order in TRAJECTORY_ORDER.items()},
+        Latent.RESIDUAL_FORCE: residual,
+    }
 
 
 def diagonal_only(impedance: Tensor) -> Tensor:

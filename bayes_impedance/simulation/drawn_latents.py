@@ -7,9 +7,9 @@ import math
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpstrf
 from torch import Tensor
 
+from bayes_impedance.engines.gaussian import draw_gaussian
 from bayes_impedance.features import Features
 from bayes_impedance.kernels.coupled import CoupledImpedanceKernel, CoupledInteractionKernel
 from bayes_impedance.kernels.coupled_terms import CoupledProcess, contract
@@ -40,7 +40,7 @@ def draw_group(
     x = features.inputs[:, group : group + 1, :n]
     kernel = model.kernel
     impedance = kernel.impedance
-    deviation = _sample(_trajectory_covariance(impedance, x, periodic), generator)
+    deviation = draw_gaussian(_trajectory_covariance(impedance, x, periodic), generator)
     desired = features.trajectory_mean[:, group : group + 1, :n] + torch.stack(
         deviation.split(n, dim=-1), dim=-1
     )
@@ -51,7 +51,7 @@ def draw_group(
         own_impedance = known[:, None, :n]
     coupled = isinstance(kernel, CoupledInteractionKernel)
     own = kernel.axis_residuals(x[0], x[0]) if coupled else kernel.residual_covariance(x, x)
-    residual = _sample(own, generator)
+    residual = draw_gaussian(own, generator)
     standard = torch.randn(residual.shape, generator=generator, dtype=residual.dtype)
     noise = model.noise_variance.sqrt() * standard
     parts = (desired, own_impedance, residual, noise)
@@ -84,35 +84,8 @@ def _draw_impedance(
     if isinstance(process, CoupledProcess):
         n = x.shape[-2]
         covariance = process.gaussian_covariance(x[0], x[0])
-        draw = _sample(covariance.expand(*covariance.shape[:-2], n, n), generator)
+        draw = draw_gaussian(covariance.expand(*covariance.shape[:-2], n, n), generator)
         return contract(process.dyads, process.levels[..., 0] * draw.exp()).movedim(1, -1)
-    draw = _sample(process.gaussian_covariance(x, x), generator)
+    draw = draw_gaussian(process.gaussian_covariance(x, x), generator)
     level = process.level[..., 0]
     return level + draw if process.law == "gaussian" else level * draw.exp()
-
-
-def _sample(covariance: Tensor, generator: torch.Generator) -> Tensor:
-    """A draw of N(0, covariance), `(..., n)`; positive semidefinite is enough."""
-    scale = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
-    # On the scale of correlations rounding does not carry from accelerations over to positions.
-    safe = torch.where(scale > 0, scale, 1.0)
-    correlation = covariance / (safe.unsqueeze(-1) * safe.unsqueeze(-2))
-    standard = torch.randn(scale.shape, generator=generator, dtype=scale.dtype)
-    drawn = [
-        _factor(c) @ z
-        for c, z in zip(
-            correlation.reshape(-1, *correlation.shape[-2:]), standard.flatten(0, -2), strict=True
-        )
-    ]
-    return scale * torch.stack(drawn).reshape(scale.shape)
-
-
-def _factor(correlation: Tensor) -> Tensor:
-    """R with R Rᵀ = `correlation` to rounding, by Cholesky with pivoting: it ends at the numerical rank."""
-    n = correlation.shape[-1]
-    lower, pivots, rank, _ = dpstrf(correlation.numpy(), lower=1)
-    factor = np.tril(lower)
-    factor[:, rank:] = 0.0
-    result = np.empty((n, n))
-    result[pivots - 1] = factor
-    return torch.from_numpy(result)

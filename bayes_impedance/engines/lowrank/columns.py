@@ -98,6 +98,18 @@ class Design:
         none = trajectory[..., :0]
         return _join(own, none), _join(shared, none)
 
+    def by_axis(self, own: Tensor, shared: Tensor) -> tuple[Tensor, Tensor]:
+        """Coefficients of trajectory and residual, `(axes, features)` each, of those that `split` set apart."""
+        residual = sum(basis.size for basis in self.residual_bases)
+        axes = (own.shape[-1] + shared.shape[-1]) // (self.basis.size + residual) if self.coupled else 1
+        left = {True: own, False: shared}
+        parts = []
+        for label, size in ((self.layout.trajectory, self.basis.size), (self.layout.residual, residual)):
+            values = left[label is not None]
+            part, left[label is not None] = values[..., : axes * size], values[..., axes * size :]
+            parts.append(part.reshape(axes, size) if self.coupled else part)
+        return parts[0], parts[1]
+
     def rows(self, values: Tensor) -> Tensor:
         """Values `(axes, groups, n)` in the order of the rows of these matrices, `(axes|1, groups, rows)`."""
         return values.transpose(0, 1).flatten(1).unsqueeze(0) if self.coupled else values

@@ -18,7 +18,7 @@ from bayes_impedance.engines.given_impedance import (
 from bayes_impedance.engines.lowrank.blocks import Batch, batches
 from bayes_impedance.engines.lowrank.columns import Design
 from bayes_impedance.engines.lowrank.hilbert import Accuracy
-from bayes_impedance.engines.lowrank.prediction import predict
+from bayes_impedance.engines.lowrank.prediction import draw, predict
 from bayes_impedance.engines.lowrank.support import own_column, unsupported
 from bayes_impedance.engines.lowrank.woodbury import Rows, Solution, Source, regress
 from bayes_impedance.errors import ConfigurationError
@@ -40,6 +40,7 @@ class LowRankEngine:
 
     def __init__(self, features: Features, coupled: bool, accuracy: Accuracy | None = None) -> None:
         self.features, self.coupled, self.accuracy = features, coupled, accuracy
+        self._last: tuple[Features, int | None, tuple[Batch, ...]] | None = None
         self._batches: dict[int | None, tuple[Batch, ...]] = {}
 
     def log_likelihood_given_impedance(self, processes: Processes, impedance: Tensor) -> Tensor:
@@ -77,6 +78,27 @@ class LowRankEngine:
                 own_column(processes),
             )
 
+    def draw(
+        self,
+        processes: Processes,
+        impedance: Tensor,
+        target: Features,
+        target_impedance: Tensor,
+        generator: torch.Generator,
+    ) -> Mapping[Latent, Tensor]:
+        """See `ConditionalEngine`; features as for `posterior`.
+
+        Raises:
+            ConfigurationError: processes that features cannot hold, see `unsupported`.
+            NotPositiveDefiniteError: rounding leaves no Cholesky factor.
+        """
+        with torch.no_grad():
+            design, solution = self.coefficients(processes, impedance, target)
+            sources = self._blocks(processes)
+            known = as_read(target_impedance, self.coupled)
+            blocks = self._target_blocks(target, own_column(processes))
+            return draw(design, solution, sources, target, known, blocks, generator)
+
     def design(self, processes: Processes, target: Features | None = None) -> Design:
         """Design matrices that hold at the engine's samples, and at those of `target`.
 
@@ -112,6 +134,13 @@ class LowRankEngine:
         if column not in self._batches:
             self._batches[column] = batches(self.features, column)
         return self._batches[column]
+
+    def _target_blocks(self, target: Features, column: int | None) -> tuple[Batch, ...]:
+        """Those of the samples of `target`, which one call after another has in common."""
+        if self._last is None or self._last[0] is not target or self._last[1] != column:
+            blocks = [block for batch in batches(target, column) for block in batch.blocks()]
+            self._last = target, column, tuple(blocks)
+        return self._last[2]
 
     def _solve(self, processes: Processes, design: Design, impedance: Tensor) -> Solution:
         assert self.features.force is not None

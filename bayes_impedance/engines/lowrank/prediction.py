@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from bayes_impedance.engines.given_impedance import LATENTS, MeanAndVariance, prior_mean
+from bayes_impedance.engines.given_impedance import LATENTS, MeanAndVariance, drawn_latents, prior_mean
 from bayes_impedance.engines.lowrank.blocks import Batch, batches
 from bayes_impedance.engines.lowrank.columns import Design
 from bayes_impedance.engines.lowrank.woodbury import Own, Solution
@@ -29,11 +29,7 @@ def predict(
     its own; without one its own features have their prior.
     """
     x = target.inputs
-    own = {
-        (batch.group, label): _block(part, b)
-        for batch, part in zip(sources, solution.own, strict=True)
-        for b, label in enumerate(batch.labels)
-    }
+    own = _by_label(solution, sources)
     result = {
         latent: (prior_mean(design.layout, target, impedance, latent).clone(), x.new_zeros(x.shape[:-1]))
         for latent in LATENTS
@@ -46,6 +42,58 @@ def predict(
                 result[latent][0][:, block.group, block.index[0]] += mean
                 result[latent][1][:, block.group, block.index[0]] = variance
     return result
+
+
+def draw(
+    design: Design,
+    solution: Solution,
+    sources: Sequence[Batch],
+    target: Features,
+    impedance: Tensor,
+    blocks: Sequence[Batch],
+    generator: torch.Generator,
+) -> Mapping[Latent, Tensor]:
+    """One draw of every latent at `target`, from one of all coefficients; `blocks` of its samples have one label each.
+
+    See `predict`.
+    """
+    own, x = _by_label(solution, sources), target.inputs
+    shared = solution.mean + _of_precision(solution.factor, generator)
+    deviation, residual = x.new_zeros(*x.shape[:-1], 3), x.new_zeros(x.shape[:-1])
+    for block in blocks:
+        known = own.get((block.group, block.labels[0])) or _prior(solution.own[0])
+        beta = shared[:, block.group]
+        gamma = known.offset[:, 0] - (known.slope[:, 0] @ beta.unsqueeze(-1))[..., 0]
+        gamma = gamma + _of_precision(known.factor[:, 0], generator)
+        coefficients, of_residual = design.by_axis(gamma, beta)
+        inputs, place = block.take(x), (slice(None), block.group, block.index[0])
+        jet = design.basis.jet(design.layout.path(inputs))
+        deviation[place] = torch.stack([_times(part, coefficients) for part in jet], dim=-1)
+        start = 0
+        for basis in design.residual_bases:
+            stop = start + basis.size
+            residual[place] += _times(basis.values(inputs), of_residual[:, start:stop])
+            start = stop
+    return drawn_latents(design.layout, target, impedance, deviation, residual)
+
+
+def _times(features: Tensor, coefficients: Tensor) -> Tensor:
+    """Process `(axes, n)` of `features` `(axes, 1, n, features)`, where axes may have the same ones."""
+    return (features @ coefficients[:, None, :, None])[:, 0, :, 0]
+
+
+def _of_precision(factor: Tensor, generator: torch.Generator) -> Tensor:
+    """A draw of mean zero whose precision has the Cholesky factor `factor`."""
+    standard = torch.randn(factor.shape[:-1], generator=generator, dtype=factor.dtype)
+    return torch.linalg.solve_triangular(factor.mT, standard.unsqueeze(-1), upper=True)[..., 0]
+
+
+def _by_label(solution: Solution, sources: Sequence[Batch]) -> dict[tuple[int, float], Own]:
+    return {
+        (batch.group, label): _block(part, b)
+        for batch, part in zip(sources, solution.own, strict=True)
+        for b, label in enumerate(batch.labels)
+    }
 
 
 def _block(own: Own, b: int) -> Own:

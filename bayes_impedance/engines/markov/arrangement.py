@@ -146,15 +146,15 @@ def arrange(samples: Samples, structure: Structure, axes: int) -> Sequences:
     Raises:
         ConfigurationError: the input of a residual term goes back where θ does not, or there are too many states.
     """
-    trajectory, residual, sequence = _processes(samples, structure)
+    trajectory, residual, sequence = process_numbers(samples, structure)
     order = np.lexsort((*samples.own.T[::-1], samples.theta, sequence))
     sequence, trajectory, residual = sequence[order], trajectory[order], residual[order]
     observed = samples.observed[order]
     fresh = [_unobserved(process, observed) for process in (trajectory, residual)]
-    columns = [_steps(samples.theta[order], trajectory)]
+    columns = [increments(samples.theta[order], trajectory)]
     for own, term in zip(samples.own.T[:, order], structure.terms, strict=True):
         # Of a process that nothing is observed of only the prior is known, wherever it is.
-        step = np.where(fresh[1], 0.0, _steps(own, residual))
+        step = np.where(fresh[1], 0.0, increments(own, residual))
         _check_increasing(step, term, samples.theta[order])
         columns.append(step)
     starts = np.flatnonzero(np.diff(sequence, prepend=-1))
@@ -221,7 +221,7 @@ def _term(kernel: Stationary) -> Term:
     return Term(size, int(columns[0]))
 
 
-def _processes(samples: Samples, structure: Structure) -> tuple[Integers, Integers, Integers]:
+def process_numbers(samples: Samples, structure: Structure) -> tuple[Integers, Integers, Integers]:
     """Number of the trajectory, of the residual and of the sequence of each sample; equal numbers share it."""
     trajectory = _numbered(samples.group, samples.trajectory)
     residual = _numbered(samples.group, samples.residual)
@@ -243,8 +243,8 @@ def _unobserved(process: Integers, observed: NDArray[np.bool_]) -> NDArray[np.bo
     return np.bincount(process, weights=observed)[process] == 0
 
 
-def _steps(value: Floats, process: Integers) -> Floats:
-    """Increments of `value` from sample to sample of a process, 0 at its first."""
+def increments(value: Floats, process: Integers) -> Floats:
+    """Those of `value` from sample to sample of a `process` `(n,)`, 0 at its first."""
     order = np.argsort(process, kind="stable")
     steps = np.zeros(len(value))
     same = np.diff(process[order]) == 0

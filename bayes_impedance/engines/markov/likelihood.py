@@ -79,11 +79,12 @@ def run_filters(
 
 
 def smoothed_states(
-    arrays: list[Tensor], sequences: Sequences, targets: np.ndarray[Any, Any]
+    arrays: list[Tensor], sequences: Sequences, targets: np.ndarray[Any, Any], spread: bool
 ) -> tuple[Tensor, Tensor]:
     """Posterior mean `(filters, m, states)` and covariance of the states of the blocks at m samples.
 
-    `targets` `(n,)`: the row of the result at each sample of the sequences, −1 for none.
+    `targets` `(n,)`: the row of the result at each sample of the sequences, −1 for none. Covariances are
+    `(filters, m, 0, 0)` without `spread`.
 
     Raises:
         NotPositiveDefiniteError: rounding left no positive variance of a force.
@@ -92,7 +93,8 @@ def smoothed_states(
     arrays = [value.contiguous() for value in arrays]
     none = np.zeros(len(sequences.group))
     means = torch.zeros(arrays[0].shape[0], count, width, dtype=torch.float64)
-    covariances = torch.zeros(*means.shape, width, dtype=torch.float64)
+    square = (width, width) if spread else (0, 0)
+    covariances = torch.zeros(*means.shape[:2], *square, dtype=torch.float64)
     for i, (_, stored) in enumerate(run_filters(arrays, sequences, store=True)):
         data = Data(*(value[i].numpy() for value in arrays))
         sweep(sequences.plan, data, stored, none, data, targets, means[i].numpy(), covariances[i].numpy())

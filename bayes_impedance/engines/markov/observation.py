@@ -104,6 +104,22 @@ class Scales:
         residual = residual.unsqueeze(1).expand(*trajectory.shape[:3], residual.shape[-1])
         return torch.cat([trajectory, residual], dim=-1)
 
+    def by_axis(self, states: Tensor, structure: Structure) -> Tensor:
+        """States of the blocks `(filters, n, states)` of each axis, `(n, axes, states)`."""
+        if not self.coupled:
+            return states.transpose(0, 1)
+        axes, width = len(self.sd), sum(term.size for term in structure.terms)
+        trajectory, residual = states[0].split([3 * axes, width * axes], dim=-1)
+        return torch.cat([trajectory.unflatten(-1, (axes, 3)), residual.unflatten(-1, (axes, width))], dim=-1)
+
+    def latents(self, states: Tensor, samples: Samples, structure: Structure) -> tuple[Tensor, Tensor]:
+        """f, ḟ, f̈ `(n, axes, 3)` and ũ `(n, axes)` of the states of each axis, see `by_axis`."""
+        position, slope, curvature = (states[..., :3] * self._powers()).unbind(-1)
+        rate, change = samples.velocity.unsqueeze(-1), samples.acceleration.unsqueeze(-1)
+        deviation = torch.stack([position, rate * slope, change * slope + rate**2 * curvature], dim=-1)
+        first = [3 + sum(term.size for term in structure.terms[:j]) for j in range(len(structure.terms))]
+        return deviation, (states[..., first] * self.residual_sd).sum(-1)
+
     def _powers(self) -> Tensor:
         """(σ, σλ, σλ²) `(axes, 3)`."""
         return torch.stack([self.sd, self.sd * self.rate, self.sd * self.rate**2], dim=-1)

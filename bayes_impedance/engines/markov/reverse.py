@@ -44,7 +44,8 @@ def sweep(plan, data, stored, weights, results, targets, means, covariances):  #
     """Gradients, posteriors, or both.
 
     ∂(Σ_k `weights[k]` log p_k) by each array of `data` to `results`, zeros of the same shapes, unless weights are zero;
-    the posterior of the states of the blocks at sample t to row `targets[t]` of `means` and `covariances`, unless −1.
+    the posterior of the states of the blocks at sample t to row `targets[t]` of `means` and `covariances`, unless −1;
+    means alone where covariances are `(m, 0, 0)`.
     """
     place = stored.shape[0]
     for k in range(plan.states.shape[0] - 1, -1, -1):
@@ -169,7 +170,7 @@ def _moments(i, a, record, e, row, work):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _smoothed(plan, t, i, record, adjoint, information, mean, covariance):  # type: ignore[no-untyped-def]
-    """m + P μ and P − P Λ P of the states of the blocks at sample t, block after block."""
+    """m + P μ and P − P Λ P (unless that is empty) of the states of the blocks at sample t, block after block."""
     axes, size, width = record.g.shape[1], adjoint.shape[0], mean.shape[0]
     # Rows of P: those of P∞ are its product with unit vectors.
     rows, index = np.zeros((width, size)), np.zeros(width, dtype=np.int64)
@@ -186,6 +187,9 @@ def _smoothed(plan, t, i, record, adjoint, information, mean, covariance):  # ty
     weighted = np.zeros(size)
     for j in range(width):
         mean[j] = record.mean[i, index[j]] + np.sum(rows[j] * adjoint)
+    if covariance.shape[0] == 0:
+        return
+    for j in range(width):
         for k in range(size):
             weighted[k] = np.sum(information[k] * rows[j])
         for k in range(width):
