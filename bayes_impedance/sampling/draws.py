@@ -22,7 +22,7 @@ class Draws:
 
     `stats`: by name, `(chains, draws)` each: for nuts `lp`, `diverging`, `n_steps`, `acceptance_rate`, `step_size`,
     `energy`; for approximations `lp`. `pareto_k` is the shape of the tail of their importance ratios, None for nuts;
-    `lost` says of each chain that died with what.
+    `lost` says of each chain that died with what; `remarks` are what else a reader should know of how they were drawn.
     """
 
     method: SamplingMethod
@@ -30,6 +30,7 @@ class Draws:
     stats: Mapping[str, NDArray[np.generic]]
     pareto_k: float | None = None
     lost: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -21,13 +21,16 @@ def pyro_program(density: JointDensity) -> Program:
     """A Pyro model whose posterior is `density`: sites are its parameters, forces enter as the factor `force`.
 
     Deterministic sites `stiffness` [N/m], `damping` [Ns/m] and `mass` [kg] `(groups, n, axes, axes)` are those at the
-    samples. Where no Cholesky factor is found the factor is NaN, which a sampler counts as a divergence.
+    samples. Where no Cholesky factor is found, or the likelihood overflows, the factor is −∞, which a sampler counts as
+    a divergence; NaN Pyro refuses.
 
     Example:
         >>> from bayes_impedance.config import load_config
         >>> callable(pyro_program)
         True
     """
+
+    nowhere = torch.full((), -torch.inf, dtype=torch.float64)
 
     def program() -> dict[str, Tensor]:
         values = {p.name: pyro.sample(p.name, prior(p)) for p in density.parameters}
@@ -37,8 +40,8 @@ def pyro_program(density: JointDensity) -> Program:
         try:
             likelihood = density.log_likelihood(values)
         except NotPositiveDefiniteError:
-            likelihood = torch.full((), torch.nan, dtype=torch.float64)
-        pyro.factor("force", likelihood)
+            likelihood = nowhere
+        pyro.factor("force", likelihood if bool(likelihood.isfinite()) else nowhere)
         return values
 
     return program
