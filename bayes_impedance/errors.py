@@ -29,6 +29,10 @@ class OutputError(BayesImpedanceError):
     """An output file or folder cannot be written."""
 
 
+class SamplingError(BayesImpedanceError):
+    """No chain lived to draw anything."""
+
+
 class SimulationError(BayesImpedanceError):
     """An arm, a device or a task is not physical, out of reach, or cannot be integrated at the step asked for."""
 
@@ -42,4 +46,4 @@ class LogWarning(BayesImpedanceWarning):
 
 
 class JournalWarning(BayesImpedanceWarning):
-    """Training goes on, but could not be continued from here if it were killed."""
+    """Training or sampling goes on, but could not be continued from here if it were killed."""

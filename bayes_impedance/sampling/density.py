@@ -56,8 +56,18 @@ class JointDensity(TiltedDensity):
     ) -> None:
         self.config, self.features = config, features
         self.coupled = config.model.axes == "coupled"
-        self._model = model
-        self._functions = build_functions(config, model, inducing)
+        known = Processes.of(model, config.model.desired_trajectory.periodic)
+        # No module stays: other processes take the density over, and those of gpytorch do not travel.
+        self._known = replace(
+            known,
+            trajectory=_plain(known.trajectory),
+            residual=tuple(map(_plain, known.residual)),
+            noise_variance=known.noise_variance.detach(),
+        )
+        self._functions = tuple(
+            replace(function, covariance=_plain(function.covariance))
+            for function in build_functions(config, model, inducing)
+        )
         self._entries = {entry.name: entry for entry in model.entries}
         # Components that nothing learns stay where the hyperprior has its median.
         self._learned: tuple[Entry, ...] = tuple(hyperparameters_of(model, self._functions))
@@ -96,7 +106,7 @@ class JointDensity(TiltedDensity):
 
     def processes(self, values: Mapping[str, Tensor]) -> Processes:
         """Desired trajectory, residual force and noise at the values of their sites."""
-        known = Processes.of(self._model, self.config.model.desired_trajectory.periodic)
+        known = self._known
         noise = filled(self._entries["noise_sd"], values)[:, 0].square()
         terms = [
             self._covariance(name, term, values)
@@ -187,6 +197,12 @@ class JointDensity(TiltedDensity):
             if (entry := self._entries.get(f"{name}.{key}")) is not None
         }
         return StationaryCovariance.like(kernel, parts[scale], parts.get("length_scale"), parts.get("shape"))
+
+
+def _plain(kernel: Stationary) -> StationaryCovariance:
+    """What a kernel computes, at the hyperparameters it has."""
+    lengthscale, shape = (None if own is None else own.detach() for own in (kernel.lengthscale, kernel.shape))
+    return StationaryCovariance.like(kernel, kernel.sd.detach(), lengthscale, shape)
 
 
 def weights(values: Mapping[str, Tensor]) -> tuple[Tensor, ...]:
