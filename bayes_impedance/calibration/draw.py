@@ -9,6 +9,7 @@ import numpy as np
 from arviz_stats.base import array_stats
 from numpy.typing import NDArray
 
+from bayes_impedance.calibration.methods import posterior_draws
 from bayes_impedance.calibration.problem import Problem, one_of_prior, seeds
 from bayes_impedance.calibration.quantities import DrawLatents, Ranked
 from bayes_impedance.calibration.records import Record
@@ -18,6 +19,7 @@ from bayes_impedance.impedance_functions.threads import one_thread
 from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.sampling.density import JointDensity
 from bayes_impedance.sampling.draws import Draws
+from bayes_impedance.sampling.latents import draw_latents
 
 Array = NDArray[np.float64]
 
@@ -34,10 +36,10 @@ class Settings:
 
     config: Config
     motion: PreparedLog
-    sampler: Sampler
-    draw_latents: DrawLatents
-    seed: int
-    thinned: int
+    sampler: Sampler = posterior_draws
+    draw_latents: DrawLatents = draw_latents
+    seed: int = 0
+    thinned: int = 99
 
 
 class Trials:
@@ -113,8 +115,15 @@ def doubts(draws: Draws, wanted: int) -> tuple[str, ...]:
         found.append(f"Pareto k above {LARGEST_PARETO_K:g}")
     if draws.method == "nuts":
         coordinates = [draws.standard[..., c] for c in range(draws.standard.shape[-1])]
-        if not max(float(array_stats.rhat(own)) for own in coordinates) <= LARGEST_RHAT:
+        # Halves, so that one chain can be compared with itself.
+        if not max(float(array_stats.rhat(_halves(own))) for own in coordinates) <= LARGEST_RHAT:
             found.append(f"R-hat above {LARGEST_RHAT:g}")
         if not min(float(array_stats.ess(own)) for own in coordinates) >= wanted:
             found.append(f"fewer than {wanted} effective draws")
     return tuple(found)
+
+
+def _halves(chains: Array) -> Array:
+    """The first and the second half of each of `(chains, draws)`, as chains."""
+    half = chains.shape[1] // 2
+    return np.concatenate([chains[:, :half], chains[:, -half:]])

@@ -46,10 +46,9 @@ def plot_rank_histograms(calibration: Calibration) -> Figure:
         counts = histogram(ranks, calibration.thinned)
         low, high = histogram_band(found.count, found.bins)
         edges = np.linspace(0.0, 1.0, found.bins + 1)
-        ax.axhspan(low, high, color=PRIOR, alpha=0.3, lw=0, label=f"{BAND:.0%} of a bin of uniform ranks")
+        ax.axhspan(low, high, color=PRIOR, alpha=0.3, lw=0, label=f"{BAND:g} of uniform ranks, in a bin")
         ax.stairs(counts, edges, fill=True, color=POSTERIOR, alpha=0.7, label="ranks of the truth")
         ax.axhline(found.count / found.bins, color=MEASURED, lw=0.8)
-        ax.set_ylim(0.0, 1.1 * max(high, counts.max()))
         ax.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
 
     title = f"Ranks of the truth among draws of {calibration.method}"
@@ -67,7 +66,7 @@ def plot_ecdf_differences(calibration: Calibration) -> Figure:
         at, difference = ecdf_difference(calibration.ranks(found.name), calibration.thinned)
         low, high = (np.concatenate([[0.0], edge, [0.0]]) for edge in calibration.band)
         everywhere = np.concatenate([[0.0], at, [1.0]])
-        chance = f"{1.0 - calibration.level:.2%} of uniform ranks, everywhere"
+        chance = f"{1.0 - calibration.level:.4g} of uniform ranks, everywhere"
         ax.fill_between(everywhere, low, high, color=PRIOR, alpha=0.3, lw=0, label=chance)
         ax.plot(
             everywhere, np.concatenate([[0.0], difference, [0.0]]), color=POSTERIOR, lw=1.2, label="ranks"
