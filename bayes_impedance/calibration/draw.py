@@ -76,6 +76,9 @@ class Trials:
         except (BayesImpedanceError, RuntimeError, np.linalg.LinAlgError) as error:
             # torch says RuntimeError of a factorisation that fails.
             return Record(index, failure=f"{type(error).__name__}: {error}")
+        still = [name for name in truth if not values[name].std() > 0.0]
+        if still:
+            return Record(index, failure=f"all draws are the same: {', '.join(still)}")
         return Record(
             index,
             truth,

@@ -142,6 +142,17 @@ def test_nothing_but_failures_leaves_no_verdict() -> None:
         calibration.uniformity  # noqa: B018
 
 
+def test_draws_that_never_moved_have_no_rank() -> None:
+    def still(density, config):
+        return Draws("nuts", np.zeros((1, 200, density.size)), {})
+
+    record = Trials(settings(CONFIG, sampler=still))(0)
+    assert record.failure is not None and record.failure.startswith(
+        "all draws are the same: log stiffness x, "
+    )
+    assert record.rank == {}
+
+
 def test_a_rank_counts_draws_below_the_truth() -> None:
     trials = Trials(settings(CONFIG, sampler=importance))
     record = trials(0)
