@@ -76,7 +76,7 @@ class Trials:
         except (BayesImpedanceError, RuntimeError, np.linalg.LinAlgError) as error:
             # torch says RuntimeError of a factorisation that fails.
             return Record(index, failure=f"{type(error).__name__}: {error}")
-        still = [name for name in truth if not values[name].std() > 0.0]
+        still = [name for name in truth if not np.ptp(values[name]) > 0.0]
         if still:
             return Record(index, failure=f"all draws are the same: {', '.join(still)}")
         return Record(
@@ -118,10 +118,14 @@ def doubts(draws: Draws, wanted: int) -> tuple[str, ...]:
         found.append(f"Pareto k above {LARGEST_PARETO_K:g}")
     if draws.method == "nuts":
         coordinates = [draws.standard[..., c] for c in range(draws.standard.shape[-1])]
-        # Halves, so that one chain can be compared with itself.
-        if not max(float(array_stats.rhat(_halves(own))) for own in coordinates) <= LARGEST_RHAT:
+        # A half that did not move gives NaN, which is doubtful, too.
+        with np.errstate(all="ignore"):
+            # Halves, so that one chain can be compared with itself.
+            mixing = np.array([array_stats.rhat(_halves(own)) for own in coordinates])
+            effective = np.array([array_stats.ess(own) for own in coordinates])
+        if not bool(np.all(mixing <= LARGEST_RHAT)):
             found.append(f"R-hat above {LARGEST_RHAT:g}")
-        if not min(float(array_stats.ess(own)) for own in coordinates) >= wanted:
+        if not bool(np.all(effective >= wanted)):
             found.append(f"fewer than {wanted} effective draws")
     return tuple(found)
 
