@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing
+import signal
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -141,11 +143,12 @@ def calibrate(
     ledger = Ledger(folder, identity)
     missing = [index for index in range(draws) if index not in ledger.records]
     done = draws - len(missing)
-    for record in _records(trials, missing, min(processes, len(missing))):
-        ledger.keep(record)
-        done += 1
-        if progress is not None:
-            progress(done, draws, record.failure or ", ".join(record.unsound) or "sound")
+    with closing(_records(trials, missing, min(processes, len(missing)))) as records:
+        for record in records:
+            ledger.keep(record)
+            done += 1
+            if progress is not None:
+                progress(done, draws, record.failure or ", ".join(record.unsound) or "sound")
     return Calibration(
         settings.config.sampling.method,
         settings.thinned,
@@ -153,11 +156,12 @@ def calibrate(
     )
 
 
-def _records(trials: Trials, missing: list[int], processes: int) -> Iterator[Record]:
+def _records(trials: Trials, missing: list[int], processes: int) -> Generator[Record, None, None]:
     """Records as they come."""
     if processes <= 1:
         yield from map(trials, missing)
         return
+    others = set(multiprocessing.active_children())
     # A fork would share locks of threads that are gone in it.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(processes, context, _begin, (trials.settings,)) as pool:
@@ -169,8 +173,12 @@ def _records(trials: Trials, missing: list[int], processes: int) -> Iterator[Rec
                 "expected every process of the calibration to live, found that one died, perhaps for want of memory; "
                 "the same command continues with --out, and with --processes 1 needs less"
             ) from error
-        finally:
+        except BaseException:
+            # Ctrl-C: draws that are not done are made again by whoever continues.
             pool.shutdown(wait=False, cancel_futures=True)
+            for process in set(multiprocessing.active_children()) - others:
+                process.terminate()
+            raise
 
 
 #: Trials of a worker process.
@@ -178,6 +186,8 @@ _own: list[Trials] = []
 
 
 def _begin(settings: Settings) -> None:
+    # Ctrl-C reaches all processes of a terminal; the one that waits ends the others.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     _own[:] = [Trials(settings)]
 
 

@@ -1,6 +1,7 @@
 """Runs of a calibration: the same in any order and process, continued where they stopped, honest about failures."""
 
 import json
+import multiprocessing
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 
@@ -35,11 +36,20 @@ def test_draws_do_not_depend_on_their_order() -> None:
     assert Trials(settings(CONFIG, seed=1))(0) != trials(0)
 
 
-def test_processes_give_what_one_gives(tmp_path) -> None:
+def test_processes_give_what_one_gives_and_end_with_it(tmp_path) -> None:
+    def impatient(done: int, planned: int, state: str) -> None:
+        if done == 3:
+            raise KeyboardInterrupt
+
     alone = calibrate(settings(CONFIG, sampler=quick), 20)
-    shared = calibrate(settings(CONFIG, sampler=quick), 20, tmp_path, processes=2)
-    assert alone == shared
-    assert len((tmp_path / FILE).read_text().splitlines()) == 21
+    before = set(multiprocessing.active_children())
+    with pytest.raises(KeyboardInterrupt):
+        calibrate(settings(CONFIG, sampler=quick), 20, tmp_path, processes=2, progress=impatient)
+    assert set(multiprocessing.active_children()) <= before
+    kept = [json.loads(line) for line in (tmp_path / FILE).read_text().splitlines()[1:]]
+    assert [alone.records[record["draw"]].rank for record in kept] == [record["rank"] for record in kept]
+    assert len(kept) == 3
+    assert calibrate(settings(CONFIG, sampler=quick), 20, tmp_path) == alone
 
 
 def test_a_process_that_dies_ends_in_a_sentence(monkeypatch) -> None:
