@@ -176,8 +176,11 @@ def _records(trials: Trials, missing: list[int], processes: int) -> Generator[Re
         except BaseException:
             # Ctrl-C: draws that are not done are made again by whoever continues.
             pool.shutdown(wait=False, cancel_futures=True)
-            for process in set(multiprocessing.active_children()) - others:
+            mine = set(multiprocessing.active_children()) - others
+            for process in mine:
                 process.terminate()
+            for process in mine:
+                process.join()
             raise
 
 
