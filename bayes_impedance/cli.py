@@ -1,4 +1,4 @@
-"""The command line: demo, simulate, inspect, plan, train, infer, evaluate, show."""
+"""The command line: demo, simulate, inspect, plan, train, infer, sample, evaluate, show."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from bayes_impedance import terminal
 from bayes_impedance.commands.calibrate import calibrate_command
 from bayes_impedance.commands.inspect import inspect_command
 from bayes_impedance.commands.plan import plan_command
+from bayes_impedance.commands.sample import sample_command
 from bayes_impedance.commands.simulate import simulate_command
 from bayes_impedance.config import load_config, shipped_configurations
 from bayes_impedance.demo import coupling_errors, record, truth_errors
@@ -190,6 +191,7 @@ def demo(
 app.command(name="simulate")(simulate_command)
 app.command(name="inspect")(inspect_command)
 app.command(name="plan")(plan_command)
+app.command(name="sample")(sample_command)
 app.command(name="calibrate")(calibrate_command)
 
 

@@ -111,11 +111,13 @@ class FeatureMap:
         trial_labels: Mapping[str, int] | None = None,
         *,
         observed: bool = False,
+        samples: Sequence[NDArray[np.int64]] | None = None,
     ) -> Features:
         """Inputs of the samples of `log`; trials with equal label share what trials do not share otherwise.
 
         `trial_labels` maps `trial_key` to a label, so that two logs can be put into one covariance; `observed` leaves
-        out samples without known force, which cannot be conditioned on.
+        out samples without known force, which cannot be conditioned on. `samples`: those of each trial that are asked
+        for, all if None.
 
         Raises:
             ConfigurationError: noise of the positions is to be carried, and the motion did not pass the smoother.
@@ -124,7 +126,7 @@ class FeatureMap:
         blocks = [self._trial(trial, mean, labels[trial_key(trial)]) for trial in log.trials]
         groups = log.groups
         members = [[i for i, trial in enumerate(log.trials) if trial.group == group] for group in groups]
-        chosen = [
+        chosen = samples or [
             np.flatnonzero(trial.observed) if observed else np.arange(trial.n_samples) for trial in log.trials
         ]
         lengths = [sum(len(chosen[i]) for i in member) for member in members]

@@ -12,7 +12,7 @@ from bayes_impedance.config import Config
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
 from bayes_impedance.posterior import Marginal, Posterior
 from bayes_impedance.posterior.compute import UNITS
-from bayes_impedance.preprocessing import PreparedTrial
+from bayes_impedance.preprocessing import PreparedLog, PreparedTrial
 
 #: A posterior SD of half the prior's, and of √¾ of it.
 SUPPORTED, WEAK = 0.75, 0.25
@@ -105,7 +105,9 @@ def assess(
         for axis, average in zip(posterior.axes, _path_averages(posterior[latent]), strict=True):
             contraction = average[-1]
             support = classify(contraction) if confounded is None else Support.PRIOR_ONLY
-            sentence = _sentence(latent, axis, contraction, support, confounded, posterior)
+            prior_scale = posterior[latent].prior_scale[:, posterior.axes.index(axis)]
+            is_fixed = bool(np.isclose(prior_scale, 0.0).all())
+            sentence = verdict_sentence(latent, axis, contraction, support, confounded, is_fixed)
             verdicts.append(Verdict(latent, axis, *average, support, sentence))
     return verdicts
 
@@ -156,16 +158,12 @@ def confounding(config: Config, repetitions: int, perturbed: bool | None = None)
     return None
 
 
-def _sentence(
-    latent: Latent,
-    axis: str,
-    contraction: float,
-    support: Support,
-    confounded: str | None,
-    posterior: Posterior,
+def verdict_sentence(
+    latent: Latent, axis: str, contraction: float, support: Support, confounded: str | None, is_fixed: bool
 ) -> str:
+    """What a verdict says in words; `confounded` is why the design cannot tell, None where it can."""
     name = f"{latent.value} {axis}{axis}"
-    if np.isclose(posterior[latent].prior_scale[:, posterior.axes.index(axis)], 0.0).all():
+    if is_fixed:
         return f"{name}: fixed by the configuration, so the data had no say."
     share = f"the data removed {_percentage(contraction)} of the prior variance"
     if support is not Support.PRIOR_ONLY:
@@ -176,13 +174,13 @@ def _sentence(
     return f"{name}: prior only; {share}: {reason}."
 
 
-def caveat(verdicts: Iterable[Verdict], posterior: Posterior, config: Config) -> str | None:
+def caveat(verdicts: Iterable[Verdict], log: PreparedLog, config: Config) -> str | None:
     """What every claim above presupposes, where the log itself cannot show it; None where nothing is claimed."""
     claims = any(verdict.support is not Support.PRIOR_ONLY for verdict in verdicts)
     known = config.model.desired_trajectory.mean in ("reference", "equilibrium")
     if not claims or known:
         return None
-    if was_perturbed(posterior.log.trials) is None:
+    if was_perturbed(log.trials) is None:
         return (
             "These verdicts presume that something other than this person displaced the hand: the log has no "
             "perturbation column, and without perturbation the robot's own law can look like an arm."

@@ -11,7 +11,7 @@ from typing import Literal
 
 import torch
 
-from bayes_impedance.config import Config, load_config
+from bayes_impedance.config import Config, SamplingConfig, as_functions, load_config
 from bayes_impedance.device import follow_law
 from bayes_impedance.engines.choice import MOMENTS, EngineChoice
 from bayes_impedance.engines.dense import Observations, check_capacity
@@ -31,6 +31,9 @@ from bayes_impedance.log import InteractionLog
 from bayes_impedance.posterior import Posterior, compute_posterior
 from bayes_impedance.preprocessing import PreparedLog, prepare
 from bayes_impedance.priors import Entry, ForceModel, build_force_model
+from bayes_impedance.sampling.drawn import DrawnPosterior
+from bayes_impedance.sampling.sample import Hook as SamplingProgress
+from bayes_impedance.sampling.sample import Problem, sample_posterior
 from bayes_impedance.training import Progress, TrainingReport, log_evidence, observations, train
 from bayes_impedance.trajectory_mean import TrajectoryMean
 
@@ -208,6 +211,33 @@ class ImpedanceModel:
         return compute_function_posterior(
             self.config, model, functions, prepared, target, conditioned, latents
         )
+
+    def sample(
+        self,
+        log: InteractionLog | PreparedLog,
+        given: Given = "both",
+        settings: SamplingConfig | None = None,
+        progress: SamplingProgress | None = None,
+        checkpoint: Path | None = None,
+    ) -> DrawnPosterior:
+        """Draws of impedance, hyperparameters, desired trajectory and force from their exact posterior.
+
+        The priors are those of the configuration: of a fitted model only the log counts, as far as `given` says (see
+        `posterior`). `settings` in place of those of the configuration; `checkpoint`: a folder that keeps what was
+        drawn, from which a run that was stopped continues.
+
+        Raises:
+            LogError, ConfigurationError, TooManySamplesError, NotPositiveDefiniteError, SamplingError.
+            OutputError: the checkpoint is of another posterior, or cannot be written.
+        """
+        config = as_functions(self.config)
+        prepared = self.prepare(log)
+        evidence = self._evidence(prepared, given)
+        if evidence is None:
+            raise LogError("expected a log with force to sample from, found none; name log.columns.force")
+        inducing = None if self._fit is None or self._fit.functions is None else self._fit.functions.inducing
+        problem = Problem(config, evidence, prepared, self._mean(prepared), inducing)
+        return sample_posterior(problem, settings or config.sampling, progress, checkpoint)
 
     def point_predictor(self, axis: str, group: str) -> PointPredictor:
         """Force at one sample at a time, given the training forces of a group: some .1 ms a call.

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import numpy as np
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from bayes_impedance.config import TrainingConfig
@@ -19,6 +19,8 @@ from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.posterior import Posterior
 from bayes_impedance.priors import Entry
+from bayes_impedance.sampling.drawn import DrawnPosterior
+from bayes_impedance.sampling.sample import Hook as SamplingHook
 from bayes_impedance.sensitivity import Effect, Refit, Sensitivity, in_sds
 from bayes_impedance.sensitivity import Progress as SensitivityHook
 from bayes_impedance.simulation.planning import Plan
@@ -56,6 +58,23 @@ def sensitivity_progress(console: Console) -> Iterator[SensitivityHook]:
 def planning_progress(console: Console) -> Iterator[PlanningHook]:
     """A bar over simulated sessions; hidden where the output is no terminal."""
     with _step_progress(console, "planning") as hook:
+        yield hook
+
+
+@contextmanager
+def sampling_progress(console: Console) -> Iterator[SamplingHook]:
+    """A bar for the climb to the mode, each chain and the latents; hidden where the output is no terminal."""
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
+        tasks: dict[str, TaskID] = {}
+
+        def hook(what: str, done: int, total: int, state: str) -> None:
+            if what not in tasks:
+                tasks[what] = bar.add_task(what, total=total or None, state="")
+            bar.update(tasks[what], completed=done, state=state)
+
         yield hook
 
 
@@ -130,6 +149,33 @@ def print_verdicts(console: Console, model: ImpedanceModel, posterior: Posterior
     """The table, then the sentences, then what they all presuppose."""
     verdicts = model.verdicts(posterior)
     console.print(verdict_table(verdicts, off_diagonals(posterior)))
+    _print_sentences(console, verdicts, caveat(verdicts, posterior.log, model.config))
+    return verdicts
+
+
+def print_exact_verdicts(console: Console, posterior: DrawnPosterior) -> None:
+    """The same of a posterior that was drawn, with what each stiffness goes with."""
+    verdicts = [one.verdict for one in posterior.verdicts]
+    console.print(verdict_table(verdicts, posterior.off_diagonals))
+    _print_sentences(console, verdicts, caveat(verdicts, posterior.log, posterior.config))
+    for one in posterior.verdicts:
+        if one.verdict.latent is Latent.STIFFNESS and not np.isnan(one.correlation):
+            console.print(
+                f"  stiffness {2 * one.verdict.axis}: correlation {one.correlation:.2f} with the SD of the desired "
+                f"trajectory, sensitivity to its prior {one.sensitivity:.2f}",
+                highlight=False,
+            )
+
+
+def print_diagnosis(console: Console, posterior: DrawnPosterior) -> None:
+    """What draws are worth, and what to do where they are not."""
+    diagnosis = posterior.diagnosis
+    console.print(diagnosis.summary, highlight=False)
+    for finding in diagnosis.findings:
+        console.print(f"  {finding}", style="yellow", highlight=False)
+
+
+def _print_sentences(console: Console, verdicts: Sequence[Verdict], remark: str | None) -> None:
     # Parameters of which the same is to be said share a line.
     said: dict[str, list[str]] = {}
     for verdict in verdicts:
@@ -137,10 +183,8 @@ def print_verdicts(console: Console, model: ImpedanceModel, posterior: Posterior
         said.setdefault(rest, []).append(name)
     for rest, names in said.items():
         console.print(f"  {', '.join(names)}: {rest}", highlight=False)
-    remark = caveat(verdicts, posterior, model.config)
     if remark:
         console.print(f"  {remark}", style="yellow", highlight=False)
-    return verdicts
 
 
 def hyperparameter_table(model: ImpedanceModel) -> Table:

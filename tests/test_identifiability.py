@@ -108,7 +108,7 @@ def test_claims_without_perturbation_column_come_with_a_caveat(contraction: floa
     config = configuration(desired_trajectory=TRIAL_AVERAGE)
 
     def caveat_of(posterior: Posterior, config: Config) -> str | None:
-        return caveat(assess(posterior, config, 2), posterior, config)
+        return caveat(assess(posterior, config, 2), posterior.log, config)
 
     said = caveat_of(posterior_with(contraction), config)
     assert said is not None

@@ -119,6 +119,7 @@ KERNELS = (
     "kernels",
 )
 ENGINES = (
+    "engines.gaussian",
     "engines.dense",
     "engines.closed_loop",
     "engines.coupled_loop",
@@ -128,9 +129,11 @@ ENGINES = (
     "engines.markov.state_space",
     "engines.markov.recursions",
     "engines.markov.reverse",
+    "engines.markov.simulate",
     "engines.markov.arrangement",
     "engines.markov.likelihood",
     "engines.markov.observation",
+    "engines.markov.prior_draws",
     "engines.markov.engine",
     "engines.markov",
     "engines.lowrank.basis",
@@ -163,9 +166,26 @@ IMPEDANCE_FUNCTIONS = (
 SAMPLING = (
     "sampling.parameters",
     "sampling.density",
+    "sampling.transport",
     "sampling.start",
     "sampling.draws",
     "sampling.program",
+    "sampling.exceptions",
+    "sampling.kernel",
+    "sampling.nuts",
+    "sampling.checkpoint",
+    "sampling.task",
+    "sampling.chains",
+    "sampling.importance",
+    "sampling.variational",
+    "sampling.diagnosis",
+    "sampling.diagnostics",
+    "sampling.latents",
+    "sampling.places",
+    "sampling.support",
+    "sampling.drawn",
+    "sampling.dataset",
+    "sampling.sample",
     "sampling",
 )
 #: Training and posteriors of functions give what training and posteriors of moments give.
@@ -177,6 +197,7 @@ PLOTTING = (
     "plotting.ellipses",
     "plotting.plans",
     "plotting.recordings",
+    "plotting.draws",
     "plotting.files",
     "plotting",
 )
@@ -192,6 +213,7 @@ COMMANDS = (
     "commands.inspect",
     "commands.simulate",
     "commands.plan",
+    "commands.sample",
     "commands",
 )
 
@@ -262,18 +284,28 @@ FREE = ("kernels.", "evaluation.metrics", "errors")
 
 #: Libraries that only some layers may load, for they are slow or have no place elsewhere.
 CONFINED = {
-    "typer": {"cli", "commands.inspect", "commands.simulate", "commands.plan"},
+    "typer": {"cli", *COMMANDS} - {"commands", "commands.inspection_tables"},
     "rich": {"cli", "terminal", *COMMANDS} - {"commands"},
     "numba": {
         "simulation.dynamics",
         "engines.markov.state_space",
         "engines.markov.recursions",
         "engines.markov.reverse",
+        "engines.markov.simulate",
     },
     "matplotlib": set(PLOTTING) - {"plotting", "plotting.files"},
     "pydantic": set(CONFIG) - {"config"},
     "yaml": {"config.loading"},
-    "safetensors": {"persistence"},
+    "safetensors": {"persistence", "sampling.checkpoint"},
+    "pyro": {
+        "sampling.program",
+        "sampling.exceptions",
+        "sampling.kernel",
+        "sampling.task",
+        "sampling.variational",
+    },
+    "xarray": {"sampling.dataset"},
+    "arviz_stats": {"sampling.importance", "sampling.diagnostics", "sampling.support"},
     "pyarrow": {"readers.parquet"},
     "h5py": {"readers.arrays.hdf5", "readers.arrays.matlab_hdf5"},
     "filelock": {"journal"},

@@ -74,7 +74,7 @@ def test_stiffness_of_a_known_equilibrium_is_supported(robot):
     assert verdict.support is Support.SUPPORTED
     assert verdict.q05 < 138 < verdict.q95
     # The equilibrium is known, so no perturbation needs to be taken on trust.
-    assert caveat(robot.verdicts(), robot.posterior(robot.fitted.log), ROBOT) is None
+    assert caveat(robot.verdicts(), robot.fitted.log, ROBOT) is None
 
 
 def test_a_wrong_equilibrium_is_noticed(robot, misled):

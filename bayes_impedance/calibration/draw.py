@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from arviz_stats.base import array_stats
 from numpy.typing import NDArray
 
-from bayes_impedance.calibration.methods import posterior_draws
 from bayes_impedance.calibration.problem import Problem, one_of_prior, seeds
 from bayes_impedance.calibration.quantities import DrawLatents, Ranked
 from bayes_impedance.calibration.records import Record
@@ -18,8 +16,10 @@ from bayes_impedance.errors import BayesImpedanceError, ConfigurationError
 from bayes_impedance.impedance_functions.threads import one_thread
 from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.sampling.density import JointDensity
+from bayes_impedance.sampling.diagnostics import diagnose
 from bayes_impedance.sampling.draws import Draws
 from bayes_impedance.sampling.latents import draw_latents
+from bayes_impedance.sampling.sample import draw
 
 Array = NDArray[np.float64]
 
@@ -28,6 +28,16 @@ Sampler = Callable[[JointDensity, Config], Draws]
 
 #: R-hat and k of importance weights above which draws are not to be trusted.
 LARGEST_RHAT, LARGEST_PARETO_K = 1.05, 0.7
+
+
+def posterior_draws(density: JointDensity, config: Config) -> Draws:
+    """Draws as `sample` makes them, in this process: draws of a calibration are what runs side by side.
+
+    Raises:
+        NotPositiveDefiniteError: the density is not finite about its mode.
+        SamplingError: every chain died.
+    """
+    return draw(density, config.training, config.sampling, processes=1)
 
 
 @dataclass(frozen=True)
@@ -116,21 +126,19 @@ def doubts(draws: Draws, wanted: int) -> tuple[str, ...]:
         found.append("divergences")
     if draws.pareto_k is not None and not draws.pareto_k <= LARGEST_PARETO_K:
         found.append(f"Pareto k above {LARGEST_PARETO_K:g}")
-    if draws.method == "nuts":
-        coordinates = [draws.standard[..., c] for c in range(draws.standard.shape[-1])]
-        # A half that did not move gives NaN, which is doubtful, too.
-        with np.errstate(all="ignore"):
-            # Halves, so that one chain can be compared with itself.
-            mixing = np.array([array_stats.rhat(_halves(own)) for own in coordinates])
-            effective = np.array([array_stats.ess(own) for own in coordinates])
-        if not bool(np.all(mixing <= LARGEST_RHAT)):
-            found.append(f"R-hat above {LARGEST_RHAT:g}")
-        if not bool(np.all(effective >= wanted)):
-            found.append(f"fewer than {wanted} effective draws")
+    # Halves, so that one chain can be compared with itself; what did not move has no R-hat, which is doubtful, too.
+    halved = replace(draws, standard=_halves(draws.standard))
+    diagnosis = diagnose(halved, [str(c) for c in range(draws.standard.shape[-1])])
+    if draws.method == "nuts" and not all(
+        rhat is not None and rhat <= LARGEST_RHAT for rhat in diagnosis.rhat
+    ):
+        found.append(f"R-hat above {LARGEST_RHAT:g}")
+    if not all(effective is not None and effective >= wanted for effective in diagnosis.ess_bulk):
+        found.append(f"fewer than {wanted} effective draws")
     return tuple(found)
 
 
 def _halves(chains: Array) -> Array:
-    """The first and the second half of each of `(chains, draws)`, as chains."""
+    """The first and the second half of each of `(chains, draws, size)`, as chains."""
     half = chains.shape[1] // 2
     return np.concatenate([chains[:, :half], chains[:, -half:]])

@@ -12,10 +12,9 @@ from torch import Tensor
 
 from bayes_impedance.calibration.problem import Problem, rows_of
 from bayes_impedance.features import Features
-from bayes_impedance.impedance_functions.density import Designs
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.preprocessing import PreparedLog
-from bayes_impedance.sampling.density import JointDensity, weights
+from bayes_impedance.sampling.density import JointDensity
 from bayes_impedance.sampling.parameters import QUANTITIES
 
 Array = NDArray[np.float64]
@@ -58,7 +57,7 @@ class Ranked:
         self.problem = problem
         self.axes, self.groups = problem.motion.axes, problem.prior.features.groups
         self.places = Places.of(problem)
-        self._varies = [function.inducing is not None for function in problem.prior.functions({})]
+        self._varies = [not problem.prior.is_constant(j) for j in range(len(QUANTITIES))]
 
     def truth(self, standard: Array, log: PreparedLog) -> dict[str, float]:
         """Of the coordinates `(size,)` and the recording drawn at them."""
@@ -86,7 +85,9 @@ class Ranked:
         points = torch.from_numpy(standard)
         with torch.no_grad():
             sites = density.values(points)
-            impedance = np.stack([_impedance(density, target, point) for point in points])
+            impedance = np.stack(
+                [density.impedance(density.values(point), target).numpy() for point in points]
+            )
         found: dict[str, Array] = {}
         for g, group in enumerate(self.groups):
             of_group = f", group {group}" if len(self.groups) > 1 else ""
@@ -111,13 +112,6 @@ class Ranked:
                 for b in range(a + 1, len(self.axes))
             }
         return found
-
-
-def _impedance(density: JointDensity, target: Features, point: Tensor) -> Array:
-    """K, D and M at the samples of `target`, `(groups, m, 3, axes, axes)`."""
-    values = density.values(point)
-    matrices = Designs.at(density.functions(values), target.inputs).matrices(weights(values))
-    return np.asarray(matrices.numpy())
 
 
 def _hyperparameters(

@@ -16,7 +16,7 @@ from rich.table import Table
 from bayes_impedance.calibration.draw import Settings
 from bayes_impedance.calibration.run import Calibration, calibrate
 from bayes_impedance.calibration.run import Progress as Hook
-from bayes_impedance.config import Config, load_config, shipped_configurations
+from bayes_impedance.config import Config, as_functions, load_config, shipped_configurations
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.outputs import check_writable, write_json
 from bayes_impedance.plotting.calibration import save_calibration_figures
@@ -89,7 +89,7 @@ def calibrate_command(
         if path is not None:
             check_writable(path)
     changes = [*(overrides or []), *([] if method is None else [f"sampling.method={method.value}"])]
-    chosen = load_config(config, changes)
+    chosen = as_functions(load_config(config, changes))
     motion = (
         recorded_motion(chosen, log) if log is not None else synthetic_motion(chosen, repetitions, samples)
     )

@@ -9,9 +9,11 @@ from bayes_impedance.config.inference import EngineConfig as EngineConfig
 from bayes_impedance.config.inference import SamplingConfig as SamplingConfig
 from bayes_impedance.config.inference import TrainingConfig as TrainingConfig
 from bayes_impedance.config.loading import Config as Config
+from bayes_impedance.config.loading import as_functions as as_functions
 from bayes_impedance.config.loading import as_yaml as as_yaml
 from bayes_impedance.config.loading import dump_config as dump_config
 from bayes_impedance.config.loading import load_config as load_config
+from bayes_impedance.config.loading import override_config as override_config
 from bayes_impedance.config.loading import parse_config as parse_config
 from bayes_impedance.config.loading import replace_value as replace_value
 from bayes_impedance.config.loading import shipped_configurations as shipped_configurations

@@ -55,9 +55,9 @@ class TrainingConfig(Section):
 class SamplingConfig(Section):
     """How posteriors of impedance and hyperparameters are drawn.
 
-    `nuts`: `chains` of `warmup` iterations and then `draws`, each step aimed at `target_acceptance`, in trees of at most
-    2^`max_tree_depth` steps. `svi`: a Gaussian `guide`, fitted in `steps`. `laplace`: the curvature at the mode. The
-    last two give `chains` times `draws` as well. Functions are kept at `places` of their input.
+    `nuts`: `chains` of `warmup` iterations and then `draws`, each step aimed at `target_acceptance`, in trees of at
+    most 2^`max_tree_depth` steps. `svi`: a Gaussian `guide`, fitted in `steps`. `laplace`: the curvature at the mode.
+    The last two give `chains` times `draws` as well. Functions are kept at `places` of their input.
     """
 
     method: SamplingMethod = "nuts"

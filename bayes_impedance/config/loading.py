@@ -173,7 +173,15 @@ def parse_config(content: Any, where: str = "configuration", overrides: Iterable
     """
     if not isinstance(content, Mapping):
         raise ConfigurationError(f"{where}: expected a mapping of sections, got {type(content).__name__}")
-    config = _validate(content, where)
+    return override_config(_validate(content, where), overrides)
+
+
+def override_config(config: Config, overrides: Iterable[str]) -> Config:
+    """`config` with KEY=VALUE overrides.
+
+    Raises:
+        ConfigurationError: as `load_config`.
+    """
     assignments = list(overrides)
     if not assignments:
         return config
@@ -197,6 +205,19 @@ def replace_value(config: Config, key: str, value: Any) -> Config:
     Raises ConfigurationError as load_config does.
     """
     return _validate(_assign(config.model_dump(mode="json"), key.split("."), value), key)
+
+
+def as_functions(config: Config) -> Config:
+    """`config` with impedance as a function, which is what the likelihood given impedance takes.
+
+    Raises:
+        ConfigurationError: its priors do not allow that.
+    """
+    if config.engine.impedance == "map":
+        return config
+    content = config.model_dump(mode="json")
+    content["engine"] |= {"impedance": "map", "name": "auto"}
+    return _validate(content, "sampling, which takes engine.impedance: map")
 
 
 def dump_config(config: Config) -> str:

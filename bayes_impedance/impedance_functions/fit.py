@@ -73,11 +73,13 @@ def take_turns(
     gradient_tolerance: float,
     progress: Callable[[int, float], None] | None,
     vary: Callable[[Array, Array], tuple[Array, float]] | None = None,
+    turns: int = TURNS,
+    settled: float = SETTLED,
 ) -> tuple[Array, Array, Climb]:
     """Hyperparameters of greatest evidence and the mode of the weights there, with the precision of both.
 
     Mode and evidence take turns; `vary` changes what the density does not hold, and says where the mode then is and how
-    far that moved.
+    far that moved. After at most `turns`, or where a turn moves no hyperparameter by `settled`, they end.
 
     Raises:
         NotPositiveDefiniteError: the likelihood is not finite somewhere on the way.
@@ -85,7 +87,7 @@ def take_turns(
     climb = Climb(density, gradient_tolerance, progress)
     point = climb(start, None, min(FIRST, max_iterations))
     precision = _precision(density, point)
-    for _ in range(TURNS):
+    for _ in range(turns):
         before, moved = point[density.weight_count :], 0.0
         density.tilt, density.anchor = occam(density, point, precision), None
         if vary is not None:
@@ -93,10 +95,10 @@ def take_turns(
         density.anchor = point
         point = climb(point, laplace.covariance(precision), max_iterations)
         precision = _precision(density, point)
-        if max(moved, np.max(np.abs(point[density.weight_count :] - before), initial=0.0)) < SETTLED:
+        if max(moved, np.max(np.abs(point[density.weight_count :] - before), initial=0.0)) < settled:
             break
     else:
-        climb.outcome = f"STOP: {TURNS} TURNS OF MODE AND EVIDENCE HAVE NOT SETTLED"
+        climb.outcome = f"STOP: {turns} TURNS OF MODE AND EVIDENCE HAVE NOT SETTLED"
     return point, precision, climb
 
 

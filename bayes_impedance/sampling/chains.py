@@ -27,7 +27,7 @@ from bayes_impedance.config import SamplingConfig
 from bayes_impedance.errors import JournalWarning, SamplingError
 from bayes_impedance.impedance_functions.threads import one_thread
 from bayes_impedance.sampling.checkpoint import Checkpoint
-from bayes_impedance.sampling.density import JointDensity
+from bayes_impedance.sampling.density import SampledDensity
 from bayes_impedance.sampling.draws import Draws, Progress
 from bayes_impedance.sampling.start import Start
 from bayes_impedance.sampling.task import Task, fingerprint
@@ -47,7 +47,7 @@ class Fates:
 
 
 def sample_nuts(
-    density: JointDensity,
+    density: SampledDensity,
     start: Start,
     settings: SamplingConfig,
     progress: Progress | None = None,

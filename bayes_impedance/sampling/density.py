@@ -8,6 +8,7 @@ integrated out by an engine given impedance (docs/model.md §13), the determinan
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -41,7 +42,47 @@ Array = NDArray[np.float64]
 FEW = 50
 
 
-class JointDensity(TiltedDensity):
+class SampledDensity(TiltedDensity):
+    """A log density that samplers climb and walk on, over coordinates of about unit size before any force."""
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates."""
+        return len(self.free)
+
+    @abstractmethod
+    def log_density(self, coordinates: Tensor) -> Tensor:
+        """log p(coordinates | u) up to a constant, at coordinates `(size,)` [nats].
+
+        Raises:
+            NotPositiveDefiniteError: it is not finite there.
+        """
+
+    def settle(self, point: Array, precision: Array) -> tuple[Array, float]:
+        """Take up what is known about a mode, its `precision` `(size, size)`; the same place, and how far it moved.
+
+        Coordinates that know nothing of modes stay as they are.
+        """
+        return point, 0.0
+
+    def joint(self, point: Array) -> tuple[float, Array]:
+        """`log_density` and its gradient.
+
+        Raises:
+            NotPositiveDefiniteError: it is not finite there.
+        """
+        coordinates = torch.from_numpy(point).clone().requires_grad_()
+        value = self.log_density(coordinates)
+        (gradient,) = torch.autograd.grad(value, coordinates)
+        if not (bool(value.isfinite()) and bool(gradient.isfinite().all())):
+            raise NotPositiveDefiniteError(
+                "expected a finite posterior density, found one that overflows, or its gradient does; check log.units, "
+                "and that the medians under model are of the size that their unit lets expect"
+            )
+        return float(value.detach()), gradient.numpy()
+
+
+class JointDensity(SampledDensity):
     """Log density of weights and hyperparameters given the forces of `features`.
 
     `parameters` in the order of their coordinates; `engine_choice` says which engine marginalises, and why.
@@ -77,12 +118,12 @@ class JointDensity(TiltedDensity):
         )
         sizes = [parameter.size for parameter in self.parameters]
         super().__init__(sum(sizes[: len(QUANTITIES)]), np.ones(sum(sizes), dtype=bool))
-        self._sizes = sizes
+        self.sizes = sizes
         medians = {p.name: p.median.expand(p.shape) for p in self.parameters if p.median is not None}
         with torch.no_grad():
             processes = self.processes(medians)
             self._fixed = tuple(
-                None if self._varies(name) else function.design(features.inputs)
+                None if self.varies(name) else function.design(features.inputs)
                 for name, function in zip(QUANTITIES, self._functions, strict=True)
             )
         self.engine_choice: EngineChoice = choose_engine(
@@ -90,14 +131,9 @@ class JointDensity(TiltedDensity):
         )
         self.engine = build_engine(self.engine_choice.name, config.engine, processes, features, self.coupled)
 
-    @property
-    def size(self) -> int:
-        """Number of coordinates."""
-        return len(self.free)
-
     def values(self, standard: Tensor) -> dict[str, Tensor]:
         """Values of all sites at coordinates `(..., size)`, by name."""
-        parts = standard.split(self._sizes, dim=-1)
+        parts = standard.split(self.sizes, dim=-1)
         return {p.name: p.value(part) for p, part in zip(self.parameters, parts, strict=True)}
 
     def standard(self, values: Mapping[str, Tensor]) -> Tensor:
@@ -119,25 +155,26 @@ class JointDensity(TiltedDensity):
         """K, D and M as functions, at the log-SDs and length scales among the values."""
         return tuple(
             replace(function, covariance=self._covariance(name, function.covariance, values, scale="log_sd"))
-            if self._varies(name)
+            if self.varies(name)
             else function
             for name, function in zip(QUANTITIES, self._functions, strict=True)
         )
 
-    def designs(self, values: Mapping[str, Tensor]) -> Designs:
-        """Designs of K, D and M at the samples whose forces are given."""
+    def designs(self, values: Mapping[str, Tensor], target: Features | None = None) -> Designs:
+        """Designs of K, D and M at the samples whose forces are given, or at those of `target`."""
         functions = self.functions(values)
+        if target is not None:
+            return Designs.at(functions, target.inputs)
         parts = zip(functions, self._fixed, strict=True)
-        return Designs(
-            functions,
-            tuple(
-                function.design(self.features.inputs) if fixed is None else fixed for function, fixed in parts
-            ),
-        )
+        inputs = self.features.inputs
+        return Designs(functions, tuple(f.design(inputs) if known is None else known for f, known in parts))
 
-    def impedance(self, values: Mapping[str, Tensor]) -> Tensor:
-        """K [N/m], D [Ns/m], M [kg] at the samples whose forces are given, `(groups, n, 3, axes, axes)`."""
-        return self.designs(values).matrices(weights(values))
+    def impedance(self, values: Mapping[str, Tensor], target: Features | None = None) -> Tensor:
+        """K [N/m], D [Ns/m], M [kg] at the samples whose forces are given, or at those of `target`.
+
+        `(groups, n, 3, axes, axes)`; what inducing inputs leave out of functions is left out here, too.
+        """
+        return self.designs(values, target).matrices(weights(values))
 
     def log_likelihood(self, values: Mapping[str, Tensor]) -> Tensor:
         """log p(u | values) of all axes and groups, with the Jacobian of the closed loop [nats].
@@ -157,31 +194,19 @@ class JointDensity(TiltedDensity):
             return value
         return value + log_jacobian(loop, impedance, self.features.valid, self.coupled).sum()
 
-    def log_density(self, standard: Tensor) -> Tensor:
+    def log_density(self, coordinates: Tensor) -> Tensor:
         """log p(z | u) up to a constant, at z `(size,)` [nats].
 
         Raises:
             NotPositiveDefiniteError: see `log_likelihood`.
         """
-        return self.log_likelihood(self.values(standard)) - 0.5 * standard.square().sum()
+        return self.log_likelihood(self.values(coordinates)) - 0.5 * coordinates.square().sum()
 
-    def joint(self, point: Array) -> tuple[float, Array]:
-        """`log_density` and its gradient.
+    def is_constant(self, quantity: int) -> bool:
+        """Whether K, D or M (0, 1, 2) does not depend on an input."""
+        return self._functions[quantity].inducing is None
 
-        Raises:
-            NotPositiveDefiniteError: it is not finite there.
-        """
-        standard = torch.from_numpy(point).clone().requires_grad_()
-        value = self.log_density(standard)
-        (gradient,) = torch.autograd.grad(value, standard)
-        if not (bool(value.isfinite()) and bool(gradient.isfinite().all())):
-            raise NotPositiveDefiniteError(
-                "expected a finite posterior density, found one that overflows, or its gradient does; check log.units, "
-                "and that the medians under model are of the size that their unit lets expect"
-            )
-        return float(value.detach()), gradient.numpy()
-
-    def _varies(self, quantity: str) -> bool:
+    def varies(self, quantity: str) -> bool:
         """Whether how a function varies is sampled, too."""
         return any(entry.name.startswith(f"{quantity}.") for entry in self._learned)
 

@@ -59,6 +59,22 @@ class Diagnosis:
         return not self.findings
 
     @property
+    def summary(self) -> str:
+        """One line: method, draws, and the worst of each diagnostic."""
+        parts = [f"{self.method}: {self.draws} draws"]
+        if self.method == "nuts":
+            parts = [f"nuts: {self.chains} chains of {self.draws} draws"]
+        if worst := self.worst(self.rhat):
+            parts.append(f"R-hat at most {worst[0][1]:.3f}")
+        if worst := self.worst(self.ess_bulk, largest=False) + self.worst(self.ess_tail, largest=False):
+            parts.append(f"ESS at least {min(value for _, value in worst):.0f}")
+        if self.divergences is not None:
+            parts.append(f"{self.divergences or 'no'} divergences")
+        if self.pareto_k is not None:
+            parts.append(f"Pareto k {self.pareto_k:.2f}")
+        return ", ".join(parts)
+
+    @property
     def least_ess(self) -> int:
         """The ESS that quantiles want."""
         return LEAST_ESS * self.chains if self.method == "nuts" else LEAST_ESS_OF_APPROXIMATION

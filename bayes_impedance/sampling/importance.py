@@ -20,7 +20,7 @@ from bayes_impedance.config import SamplingConfig
 from bayes_impedance.config.inference import SamplingMethod
 from bayes_impedance.errors import NotPositiveDefiniteError
 from bayes_impedance.impedance_functions.threads import one_thread
-from bayes_impedance.sampling.density import JointDensity
+from bayes_impedance.sampling.density import SampledDensity
 from bayes_impedance.sampling.draws import Draws, Progress
 from bayes_impedance.sampling.start import Start
 
@@ -58,7 +58,7 @@ class Weighted:
 
 
 def log_densities(
-    density: JointDensity, standard: Array, progress: Progress | None = None, done: int = 0
+    density: SampledDensity, standard: Array, progress: Progress | None = None, done: int = 0
 ) -> Array:
     """`density.log_density` at each of coordinates `(n, size)`, −∞ where it is not finite or has no Cholesky factor.
 
@@ -114,7 +114,7 @@ def smoothed(log_ratios: Array) -> tuple[Array, float]:
 
 
 def laplace_draws(
-    density: JointDensity, start: Start, settings: SamplingConfig, progress: Progress | None = None
+    density: SampledDensity, start: Start, settings: SamplingConfig, progress: Progress | None = None
 ) -> Draws:
     """Draws of Laplace's approximation, see `approximate_draws`.
 
@@ -126,7 +126,7 @@ def laplace_draws(
 
 def approximate_draws(
     method: SamplingMethod,
-    density: JointDensity,
+    density: SampledDensity,
     approximation: Start,
     settings: SamplingConfig,
     progress: Progress | None = None,
@@ -174,7 +174,7 @@ def log_t(steps: Array) -> Array:
 
 
 def _propose(
-    density: JointDensity,
+    density: SampledDensity,
     approximation: Start,
     wanted: int,
     generator: np.random.Generator,

@@ -14,7 +14,7 @@ from pyro.infer.mcmc.adaptation import BlockMassMatrix
 from torch import Tensor
 
 from bayes_impedance.config import SamplingConfig
-from bayes_impedance.sampling.density import JointDensity
+from bayes_impedance.sampling.density import SampledDensity
 from bayes_impedance.sampling.exceptions import count_failures_as_divergences
 from bayes_impedance.sampling.start import Start
 
@@ -58,7 +58,7 @@ class Trajectory:
 class Kernel(NUTS):
     """NUTS of `density` at z = `point` + `root` y, dense in y; `trajectory` tells of the last iteration."""
 
-    def __init__(self, density: JointDensity, start: Start, settings: SamplingConfig) -> None:
+    def __init__(self, density: SampledDensity, start: Start, settings: SamplingConfig) -> None:
         count_failures_as_divergences()
         self._density = density
         self._point, self._root = torch.from_numpy(start.point), torch.from_numpy(start.root)

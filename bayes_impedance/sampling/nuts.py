@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bayes_impedance.config import SamplingConfig
 from bayes_impedance.errors import NotPositiveDefiniteError
-from bayes_impedance.sampling.density import JointDensity
+from bayes_impedance.sampling.density import SampledDensity
 from bayes_impedance.sampling.kernel import Kernel, State
 from bayes_impedance.sampling.start import Start
 
@@ -44,7 +44,7 @@ class Chain:
 
     def __init__(
         self,
-        density: JointDensity,
+        density: SampledDensity,
         start: Start,
         settings: SamplingConfig,
         number: int,
@@ -129,7 +129,7 @@ def seed_of(seed: int, number: int) -> int:
     return int(np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[0] >> np.uint64(1))
 
 
-def _beginning(density: JointDensity, start: Start) -> Tensor:
+def _beginning(density: SampledDensity, start: Start) -> Tensor:
     """A standard normal draw, or a point between it and the mode where the density and its gradient are finite."""
     drawn = torch.randn(density.size, dtype=torch.float64)
     for _ in range(HALVINGS):

@@ -11,9 +11,13 @@ from numpy.typing import NDArray
 from bayes_impedance.config import TrainingConfig
 from bayes_impedance.impedance_functions import laplace
 from bayes_impedance.impedance_functions.fit import take_turns
-from bayes_impedance.sampling.density import JointDensity
+from bayes_impedance.sampling.density import SampledDensity
 
 Array = NDArray[np.float64]
+
+#: Turns of mode and evidence, and the move of a hyperparameter, in prior SDs, below which they end: a sampler goes on
+#: from there anyway.
+TURNS, SETTLED = 5, 0.2
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,7 @@ class Start:
 
 
 def find_start(
-    density: JointDensity,
+    density: SampledDensity,
     training: TrainingConfig,
     near: Array | None = None,
     progress: Callable[[int, float], None] | None = None,
@@ -48,7 +52,14 @@ def find_start(
     """
     begin = np.zeros(density.size) if near is None else near
     point, precision, climb = take_turns(
-        density, begin, training.max_iterations, training.gradient_tolerance, progress
+        density,
+        begin,
+        training.max_iterations,
+        training.gradient_tolerance,
+        progress,
+        vary=density.settle,
+        turns=TURNS,
+        settled=SETTLED,
     )
     # No direction is known less than before any force.
     values, vectors = np.linalg.eigh(laplace.covariance(precision))

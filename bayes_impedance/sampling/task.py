@@ -13,7 +13,7 @@ import torch
 from bayes_impedance.config import SamplingConfig
 from bayes_impedance.errors import OutputError
 from bayes_impedance.sampling.checkpoint import Checkpoint
-from bayes_impedance.sampling.density import JointDensity
+from bayes_impedance.sampling.density import SampledDensity
 from bayes_impedance.sampling.nuts import Chain
 from bayes_impedance.sampling.start import Start
 
@@ -25,7 +25,7 @@ REPORTED = 0.25
 class Task:
     """What a chain needs to know."""
 
-    density: JointDensity
+    density: SampledDensity
     start: Start
     settings: SamplingConfig
     checkpoint: Checkpoint | None

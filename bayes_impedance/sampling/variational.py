@@ -21,7 +21,7 @@ from bayes_impedance.config import SamplingConfig
 from bayes_impedance.config.inference import Guide
 from bayes_impedance.errors import NotPositiveDefiniteError
 from bayes_impedance.impedance_functions.threads import one_thread
-from bayes_impedance.sampling.density import JointDensity
+from bayes_impedance.sampling.density import SampledDensity
 from bayes_impedance.sampling.draws import Draws, Progress
 from bayes_impedance.sampling.importance import approximate_draws
 from bayes_impedance.sampling.start import Start
@@ -56,7 +56,7 @@ class Fitted:
 
 
 def svi_draws(
-    density: JointDensity, start: Start, settings: SamplingConfig, progress: Progress | None = None
+    density: SampledDensity, start: Start, settings: SamplingConfig, progress: Progress | None = None
 ) -> Draws:
     """Draws of a guide that is fitted in `settings.steps` steps, see `fit_guide` and `approximate_draws`.
 
@@ -68,7 +68,7 @@ def svi_draws(
 
 
 def fit_guide(
-    density: JointDensity, start: Start, settings: SamplingConfig, progress: Progress | None = None
+    density: SampledDensity, start: Start, settings: SamplingConfig, progress: Progress | None = None
 ) -> Fitted:
     """Maximise the ELBO over Gaussians from Laplace's approximation `start` on, in coordinates where that is N(0, I).
 

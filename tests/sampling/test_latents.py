@@ -56,7 +56,12 @@ def test_impedance_is_that_of_the_draw_and_force_has_noise_of_its_own(case):
     drawn = draw_latents(density, standard, target, seed=1)
     axes, groups, m = target.inputs.shape[:3]
     assert set(drawn) == {*LATENTS, *IMPEDANCE_ORDER}
-    errors = torch.cat(density._model.kernel.impedance.layout.errors(target.inputs, order=2), dim=-1)
+    errors = torch.cat(
+        density.processes(density.values(torch.zeros(density.size, dtype=torch.float64))).layout.errors(
+            target.inputs, order=2
+        ),
+        dim=-1,
+    )
     hand = (target.trajectory_mean - errors).numpy()
     noise = []
     for i, row in enumerate(torch.from_numpy(standard)):
@@ -122,7 +127,9 @@ def test_impedance_elsewhere_is_that_of_the_functions():
     density = density_of("markov, coupled, length scales")
     features = density.features
     inputs = features.inputs.clone()
-    phase = inputs[..., density._model.kernel.impedance.layout.theta[0]].clone()
+    phase = inputs[
+        ..., density.processes(density.values(torch.zeros(density.size, dtype=torch.float64))).layout.theta[0]
+    ].clone()
     same = [column for column in range(inputs.shape[-1]) if torch.equal(inputs[..., column], phase)]
     assert len(same) == 2
     inputs[..., same] += 0.01

@@ -1,0 +1,120 @@
+"""The command `sample`: draws of impedance, desired trajectory and force from their exact posterior."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from bayes_impedance import terminal
+from bayes_impedance.config import Config, SamplingConfig, override_config
+from bayes_impedance.errors import ConfigurationError, OutputError
+from bayes_impedance.outputs import check_writable, prepare_folder
+from bayes_impedance.persistence import load_model
+from bayes_impedance.plotting.draws import save_draw_figures
+from bayes_impedance.readers import read_log
+from bayes_impedance.sampling.checkpoint import Checkpoint
+from bayes_impedance.sampling.dataset import save_netcdf
+
+SUFFIX = ".nc"
+
+
+class Method(str, Enum):
+    """How posteriors are drawn."""
+
+    nuts = "nuts"
+    svi = "svi"
+    laplace = "laplace"
+
+
+class Forces(str, Enum):
+    """Forces that are conditioned on."""
+
+    both = "both"
+    training = "training"
+    log = "log"
+
+
+def sample_command(
+    model: Annotated[
+        Path, typer.Argument(metavar="MODEL", help="Folder that train wrote.", show_default=False)
+    ],
+    logs: Annotated[
+        list[Path],
+        typer.Argument(metavar="LOG", help="Recordings; several may follow.", show_default=False),
+    ],
+    out: Annotated[Path, typer.Option(help="netCDF to write, in the schema of ArviZ: POSTERIOR.nc.")],
+    given: Annotated[
+        Forces, typer.Option(help="Forces to condition on: those trained on, those of LOG, or both.")
+    ] = Forces.both,
+    method: Annotated[
+        Method | None,
+        typer.Option(
+            help="nuts is exact in the limit; svi and laplace approximate.  \\[default: sampling.method]",
+            show_default=False,
+        ),
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Change one key of sampling, e.g. sampling.draws=1000; repeatable.",
+        ),
+    ] = None,
+    figures: Annotated[Path | None, typer.Option(help="Folder for PNG figures.")] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue a run that was killed or stopped.")
+    ] = False,
+) -> None:
+    """Draw mass, damping, stiffness and desired trajectory from their posterior given the forces, by Pyro.
+
+    The priors are those of MODEL's configuration; its hyperparameters are drawn, too. What chains have drawn is kept
+    beside the netCDF until it is written: after Ctrl-C, a crash or a power cut the same command with --resume goes on,
+    and ends with the same draws. Diagnostics are printed with advice, and kept in the file.
+    """
+    console = Console()
+    if out.suffix != SUFFIX:
+        raise OutputError(
+            f"{out}: expected a file name that ends in {SUFFIX} (netCDF), got {out.suffix!r}; name one"
+        )
+    check_writable(out)
+    # Beside the netCDF, on the same disk.
+    unfinished = out.with_name(f"{out.name}.unfinished")
+    if unfinished.exists() and not resume:
+        raise OutputError(
+            f"{unfinished}: expected no unfinished run of {out.name}, found one; add --resume to continue it, or "
+            "delete the folder to start anew"
+        )
+    trained = load_model(model)
+    settings = _settings(trained.config, overrides or [], method)
+    if figures is not None:
+        prepare_folder(figures)
+    log = read_log(logs, trained.config.log, require_force=given is Forces.log)
+    if resume and not unfinished.exists():
+        console.print("nothing to resume: sampling from the start")
+    with terminal.sampling_progress(console) as hook:
+        posterior = trained.sample(log, given.value, settings, hook, unfinished)
+    save_netcdf(posterior, out)
+    Checkpoint(unfinished, {}).remove()
+    console.print(str(posterior.engine), highlight=False, soft_wrap=True)
+    terminal.print_diagnosis(console, posterior)
+    terminal.print_exact_verdicts(console, posterior)
+    console.print(f"wrote {out}", highlight=False, soft_wrap=True)
+    if figures is not None:
+        for path in save_draw_figures(posterior, figures):
+            console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+
+
+def _settings(config: Config, overrides: list[str], method: Method | None) -> SamplingConfig:
+    for assignment in overrides:
+        if not assignment.strip().startswith("sampling."):
+            raise ConfigurationError(
+                f"--set: expected a key of sampling, such as sampling.draws=1000, got {assignment!r}, which is part "
+                "of the model; train another one with it"
+            )
+    own = [] if method is None else [f"sampling.method={method.value}"]
+    return override_config(config, [*overrides, *own]).sampling

@@ -1,0 +1,102 @@
+"""Where draws are kept: functions along phase at the average motion of a group, forces at the samples of the log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bayes_impedance.config import Config
+from bayes_impedance.preprocessing import PreparedLog, PreparedTrial
+from bayes_impedance.preprocessing.prepared import ARRAYS
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+#: Samples of the log at which forces are kept: beyond that every other one is left out, or more.
+MOST_SAMPLES = 1000
+#: Name of a motion that nobody made, so that it has a residual force of its own.
+AVERAGE = "average motion"
+
+
+@dataclass(frozen=True)
+class Places:
+    """Samples at which latents are drawn.
+
+    `samples` of each trial of `log`; among those the `places` of functions and the `forces` that are kept. `dimension`
+    of the places is `phase`, with the same values for each group, `time` of one trial, or `place` of several.
+    """
+
+    log: PreparedLog
+    samples: tuple[Integers, ...]
+    places: tuple[Integers, ...]
+    forces: tuple[Integers, ...]
+    dimension: str
+
+
+def choose_places(config: Config, log: PreparedLog, places: int) -> Places:
+    """Average motions over phase, where the desired trajectory is a function of it, else `places` samples a trial."""
+    step = -(-log.n_samples // MOST_SAMPLES)
+    forces = tuple(np.arange(0, trial.n_samples, step) for trial in log.trials)
+    none = np.zeros(0, dtype=np.int64)
+    if config.model.trajectory_input == "phase":
+        averages = tuple(average_motion(log, group, places) for group in log.groups)
+        every = (np.arange(places),) * len(averages)
+        return Places(
+            PreparedLog(log.axes, averages + log.trials),
+            every + forces,
+            every + (none,) * len(forces),
+            (none,) * len(averages) + forces,
+            "phase",
+        )
+    kept = tuple(_evenly(trial.n_samples, places) for trial in log.trials)
+    samples = tuple(np.union1d(*pair) for pair in zip(kept, forces, strict=True))
+    return Places(log, samples, kept, forces, "time" if len(log.trials) == 1 else "place")
+
+
+def average_motion(log: PreparedLog, group: str, places: int) -> PreparedTrial:
+    """Mean over the repetitions of a group at equal phase, at `places` values of the phase that all groups reach."""
+    parts = [part for name in log.groups for part in _repetitions(log, name)]
+    low = max(float(_phase(part).min()) for part in parts)
+    high = min(float(_phase(part).max()) for part in parts)
+    phase = np.linspace(low, high, places)
+    own = [part for part in parts if part.group == group]
+    values = {
+        name: np.mean([_at_phase(part, name, phase) for part in own], axis=0)
+        for name in ARRAYS
+        if name not in ("force", "perturbation", "smoothing", "repetition")
+        and all(getattr(part, name) is not None for part in own)
+    }
+    repetition = np.zeros(places, dtype=np.int64)
+    # Of the group's own name, for names of trials differ.
+    named = {"name": f"{AVERAGE} of {group}", "group": group, "source": "memory"}
+    arrays: dict[str, Any] = {**named, **values, "phase": phase, "repetition": repetition}
+    return PreparedTrial(**arrays)
+
+
+def _repetitions(log: PreparedLog, group: str) -> Iterator[PreparedTrial]:
+    for trial in log.trials:
+        if trial.group == group:
+            for number in np.unique(trial.repetition):
+                rows = np.flatnonzero(trial.repetition == number)
+                arrays = {name: getattr(trial, name) for name in ARRAYS}
+                own: dict[str, Any] = {k: None if v is None else v[rows] for k, v in arrays.items()}
+                yield replace(trial, **own, truth={})
+
+
+def _phase(trial: PreparedTrial) -> Array:
+    assert trial.phase is not None
+    return trial.phase
+
+
+def _at_phase(trial: PreparedTrial, name: str, phase: Array) -> Array:
+    values = np.asarray(getattr(trial, name))
+    columns = [np.interp(phase, _phase(trial), column) for column in values.reshape(len(values), -1).T]
+    return np.stack(columns, axis=-1).reshape(len(phase), *values.shape[1:])
+
+
+def _evenly(count: int, places: int) -> Integers:
+    return np.unique(np.linspace(0, count - 1, places).round().astype(np.int64))
