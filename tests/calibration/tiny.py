@@ -37,7 +37,7 @@ def configuration(sampling: dict[str, object] | None = None, **sections: object)
         "model": model | sections.pop("model", {}),
         "engine": {"impedance": "map", "name": "dense", "inducing": 3},
         "training": {"max_iterations": 30, "gradient_tolerance": 0.1},
-        "sampling": {"method": "laplace", "chains": 1, "draws": 200} | (sampling or {}),
+        "sampling": {"method": "laplace", "chains": 1, "draws": 300} | (sampling or {}),
     }
     return parse_config(content | sections)
 
@@ -45,7 +45,7 @@ def configuration(sampling: dict[str, object] | None = None, **sections: object)
 def importance(density, config):
     """Draws from a Gaussian about the mode, as wide as the curvature there says and half more, by their importance."""
     generator = np.random.default_rng(config.sampling.seed)
-    count, wide = 800, 1.5
+    count, wide = 1500, 1.5
     found = minimize(lambda z: [-part for part in density.joint(z)], np.zeros(density.size), jac=True)
     values, vectors = np.linalg.eigh(curvature(density, found.x))
     steps = generator.standard_normal((count, density.size))
