@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from bayes_impedance import terminal
+from bayes_impedance.commands.calibrate import calibrate_command
 from bayes_impedance.commands.inspect import inspect_command
 from bayes_impedance.commands.plan import plan_command
 from bayes_impedance.commands.sample import sample_command
@@ -191,6 +192,7 @@ app.command(name="simulate")(simulate_command)
 app.command(name="inspect")(inspect_command)
 app.command(name="plan")(plan_command)
 app.command(name="sample")(sample_command)
+app.command(name="calibrate")(calibrate_command)
 
 
 @app.command()

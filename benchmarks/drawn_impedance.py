@@ -15,6 +15,7 @@ from bayes_impedance.impedance_functions.function import build_functions, choose
 from bayes_impedance.preprocessing import PreparedLog, PreparedTrial
 from bayes_impedance.priors import build_force_model
 from bayes_impedance.simulation.generative import draw_force
+from bayes_impedance.simulation.interaction import impedance_force, impedance_truth
 from bayes_impedance.simulation.tasks import Path
 from bayes_impedance.trajectory_mean import TrajectoryMean, phase_derivatives
 
@@ -86,11 +87,10 @@ def _along(path: Path, trial: PreparedTrial) -> Array:
 
 def _with_force(trial: PreparedTrial, desired: Array, matrices: Array, noise: Array) -> PreparedTrial:
     error = desired - np.stack([trial.position, trial.velocity, trial.acceleration])
-    force = np.einsum("njab,jnb->na", matrices, error) + noise
-    truth = {
-        f"{quantity.value}_{AXES[a]}{AXES[b]}": matrices[:, j, a, b]
-        for j, quantity in enumerate(QUANTITIES)
-        for a, b in ((0, 0), (1, 1), (0, 1))
-    }
-    truth |= {f"desired_position_{axis}": desired[0, :, a] for a, axis in enumerate(AXES)}
+    impedance = matrices.transpose(2, 0, 1, 3)
+    force = impedance_force(impedance, error.transpose(2, 1, 0)).T + noise
+    truth: dict[str, Array] = {}
+    for a, axis in enumerate(AXES):
+        truth |= impedance_truth(impedance, a, AXES)
+        truth[f"desired_position_{axis}"] = desired[0, :, a]
     return replace(trial, force=force, truth=truth)

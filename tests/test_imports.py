@@ -24,7 +24,10 @@ BASELINES = (
     "baselines",
 )
 SIMULATION = (
+    "simulation.interaction",
+    "simulation.drawn_latents",
     "simulation.generative",
+    "simulation.prior_predictive",
     "simulation.arm",
     "simulation.tasks",
     "simulation.device",
@@ -34,6 +37,16 @@ SIMULATION = (
     "simulation.one_axis",
     "simulation.planning",
     "simulation",
+)
+
+CALIBRATION = (
+    "calibration.uniformity",
+    "calibration.problem",
+    "calibration.quantities",
+    "calibration.records",
+    "calibration.draw",
+    "calibration.run",
+    "calibration",
 )
 
 CONFIG = (
@@ -198,6 +211,7 @@ PLOTTING = (
     "plotting.plans",
     "plotting.recordings",
     "plotting.draws",
+    "plotting.calibration",
     "plotting.files",
     "plotting",
 )
@@ -214,6 +228,7 @@ COMMANDS = (
     "commands.simulate",
     "commands.plan",
     "commands.sample",
+    "commands.calibrate",
     "commands",
 )
 
@@ -249,6 +264,7 @@ LAYERS: tuple[frozenset[str], ...] = tuple(
             {"evaluation", "evaluation.cross_validation"},
             {"__init__"},
             SIMULATION,
+            CALIBRATION,
             {*PLOTTING, "terminal"},
             {"demo", *COMMANDS},
             {"cli"},
@@ -272,12 +288,13 @@ FAMILIES = (
     SAMPLING,
     BASELINES,
     SIMULATION,
+    CALIBRATION,
     PLOTTING,
     COMMANDS,
 )
 
 #: Only the command line and its demo show, draw or simulate anything.
-PRESENTATION = {"cli", *COMMANDS, "demo", "terminal", *PLOTTING, *SIMULATION}
+PRESENTATION = {"cli", *COMMANDS, "demo", "terminal", *PLOTTING, *SIMULATION, *CALIBRATION}
 
 #: What a kernel may know of this package: other kernels. They are to be taken into other people's code.
 FREE = ("kernels.", "evaluation.metrics", "errors")

@@ -106,10 +106,12 @@ def draw(
     settings: SamplingConfig,
     hook: Hook | None = None,
     checkpoint: Checkpoint | None = None,
+    processes: int | None = None,
 ) -> Draws:
     """Draws of the density by the method that is set, from the mode of greatest evidence on.
 
-    Samplers move in the coordinates of `TransportedDensity`; `lp` is the density of those.
+    Chains run in as many `processes` at a time, or one for each core. Samplers move in the coordinates of
+    `TransportedDensity`; `lp` is the density of those.
 
     Raises:
         NotPositiveDefiniteError: the density is not finite about its mode.
@@ -126,7 +128,7 @@ def draw(
     elif settings.method == "laplace":
         found = laplace_draws(transported, start, settings, _sampling(hook))
     else:
-        found = sample_nuts(transported, start, settings, _sampling(hook), checkpoint)
+        found = sample_nuts(transported, start, settings, _sampling(hook), checkpoint, processes)
     return replace(found, standard=transported.all_standard(found.standard))
 
 

@@ -15,16 +15,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bayes_impedance.config import Config
-from bayes_impedance.engines.gaussian import draw_gaussian
-from bayes_impedance.features import FeatureMap, Features
-from bayes_impedance.kernels.coupled import CoupledInteractionKernel
-from bayes_impedance.kernels.coupled_terms import CoupledProcess, contract
-from bayes_impedance.kernels.derivative import derivative_table
-from bayes_impedance.kernels.impedance import same_label
-from bayes_impedance.kernels.warped import ImpedanceProcess
+from bayes_impedance.features import FeatureMap
 from bayes_impedance.log import InteractionLog, Trial
 from bayes_impedance.preprocessing import PreparedLog, PreparedTrial
 from bayes_impedance.priors import ForceModel, build_force_model
+from bayes_impedance.simulation.drawn_latents import draw_group
+from bayes_impedance.simulation.interaction import (
+    device_answer,
+    force_in_loop,
+    impedance_force,
+    impedance_truth,
+)
 from bayes_impedance.trajectory_mean import TrajectoryMean
 
 Array = NDArray[np.float64]
@@ -81,12 +82,20 @@ def repeated_motion(
 
 
 def draw_force(
-    config: Config, motion: PreparedLog, seed: int, force_model: ForceModel | None = None
+    config: Config,
+    motion: PreparedLog,
+    seed: int,
+    force_model: ForceModel | None = None,
+    impedance: Tensor | None = None,
+    *,
+    in_loop: bool = False,
 ) -> PreparedLog:
     """`motion` with force drawn from the model, and the truth of every latent.
 
     Hyperparameters are those of `force_model`, else the medians of `config`. Impedance and, where trials
-    share it, the desired trajectory are drawn once a group.
+    share it, the desired trajectory are drawn once a group. `impedance` `(groups, n, 3, axes, axes)` at the samples of
+    each group is taken as it is instead. `in_loop`: velocity and acceleration are those without the person's force of
+    their instant, and the device of `config` answers it (docs/model.md §6).
 
     Example:
         >>> from bayes_impedance.config import load_config
@@ -100,44 +109,61 @@ def draw_force(
     mean = TrajectoryMean.from_training(config.model.desired_trajectory, motion)
     features = feature_map(motion, mean)
     model = build_force_model(config, feature_map) if force_model is None else force_model
+    periodic = config.model.desired_trajectory.periodic
+    known = None if impedance is None else _by_axis(impedance, config.model.axes == "coupled")
     with torch.no_grad():
-        drawn = {group: _draw_group(model, features, g, generator) for g, group in enumerate(features.groups)}
+        drawn = {
+            group: draw_group(model, features, g, generator, periodic, None if known is None else known[g])
+            for g, group in enumerate(features.groups)
+        }
+    answers = {
+        group: device_answer(features.loop, g) if in_loop and features.loop is not None else None
+        for g, group in enumerate(features.groups)
+    }
     trials = []
     counts = dict.fromkeys(features.groups, 0)
     for trial in motion.trials:
         rows = slice(counts[trial.group], counts[trial.group] + len(trial.time))
         counts[trial.group] = rows.stop
-        desired, impedance, residual, noise = (part[:, rows] for part in drawn[trial.group])
-        hand = np.stack([trial.position.T, trial.velocity.T, trial.acceleration.T], axis=-1)
-        # u = Σ_j w_j e⁽ʲ⁾ + ũ + ε, with w = (k, d, m)
-        force = _impedance_force(impedance, desired - hand) + residual + noise
-        truth: dict[str, Array] = {}
-        for a, axis in enumerate(motion.axes):
-            truth[f"desired_position_{axis}"] = desired[a, :, 0]
-            truth[f"desired_velocity_{axis}"] = desired[a, :, 1]
-            truth[f"desired_acceleration_{axis}"] = desired[a, :, 2]
-            truth[f"residual_force_{axis}"] = residual[a]
-            truth |= _impedance_truth(impedance, a, motion.axes)
-        trials.append(replace(trial, force=np.ascontiguousarray(force.T), truth=truth))
+        parts = [part[:, rows] for part in drawn[trial.group]]
+        trials.append(_with_force(trial, motion.axes, answers[trial.group], *parts))
     return PreparedLog(motion.axes, tuple(trials))
 
 
-def _impedance_force(impedance: Array, error: Array) -> Array:
-    """Σ_j w_j e⁽ʲ⁾, `(axes, n)`, of `impedance` `(axes, n, 3)`, or `(axes, n, 3, axes)` where axes are coupled."""
-    if impedance.ndim == 3:
-        return np.asarray((impedance * error).sum(-1))
-    return np.einsum("anjc,cnj->an", impedance, error)
-
-
-def _impedance_truth(impedance: Array, a: int, axes: tuple[str, ...]) -> dict[str, Array]:
-    """Impedance of axis number `a`, and where axes are coupled with those after it."""
+def _with_force(
+    trial: PreparedTrial,
+    axes: tuple[str, ...],
+    answer: Array | None,
+    desired: Array,
+    impedance: Array,
+    residual: Array,
+    noise: Array,
+) -> PreparedTrial:
+    """`trial` with what was drawn for it, as `draw_group` gives it."""
+    hand = np.stack([trial.position.T, trial.velocity.T, trial.acceleration.T], axis=-1)
+    # u = Σ_j w_j e⁽ʲ⁾ + ũ + ε, with w = (k, d, m)
+    force = impedance_force(impedance, desired - hand) + residual + noise
+    if answer is not None:
+        force = force_in_loop(force, impedance, answer)
+        hand = hand + force[..., None] * answer[:, None]
     truth: dict[str, Array] = {}
-    for j, name in enumerate(("stiffness", "damping", "mass")):
-        if impedance.ndim == 3:
-            truth[f"{name}_{axes[a]}{axes[a]}"] = impedance[a, :, j]
-        else:
-            truth |= {f"{name}_{axes[a]}{axes[b]}": impedance[a, :, j, b] for b in range(a, len(axes))}
-    return truth
+    for a, axis in enumerate(axes):
+        truth[f"desired_position_{axis}"] = desired[a, :, 0]
+        truth[f"desired_velocity_{axis}"] = desired[a, :, 1]
+        truth[f"desired_acceleration_{axis}"] = desired[a, :, 2]
+        truth[f"residual_force_{axis}"] = residual[a]
+        truth |= impedance_truth(impedance, a, axes)
+    velocity, acceleration = (np.ascontiguousarray(hand[..., order].T) for order in (1, 2))
+    return replace(
+        trial, force=np.ascontiguousarray(force.T), velocity=velocity, acceleration=acceleration, truth=truth
+    )
+
+
+def _by_axis(impedance: Tensor, coupled: bool) -> Tensor:
+    """`(groups, axes, n, 3, axes)` of `(groups, n, 3, axes, axes)`; only diagonals where axes do not couple."""
+    if coupled:
+        return impedance.permute(0, 3, 1, 2, 4)
+    return impedance.diagonal(dim1=-2, dim2=-1).permute(0, 3, 1, 2)
 
 
 def as_recording(prepared: PreparedLog, *, keep_reference: bool = False) -> InteractionLog:
@@ -151,50 +177,6 @@ def as_recording(prepared: PreparedLog, *, keep_reference: bool = False) -> Inte
         for trial in prepared.trials
     )  # fmt: skip
     return InteractionLog(prepared.axes, trials)
-
-
-def _draw_group(
-    model: ForceModel, features: Features, group: int, generator: torch.Generator
-) -> tuple[Array, Array, Array, Array]:
-    """Desired trajectory and impedance `(axes, n, 3)`, residual and noise `(axes, n)`.
-
-    Where axes are coupled impedance is `(axes, n, 3, axes)`.
-    """
-    n = len(features.rows[group])
-    x = features.inputs[:, group : group + 1, :n]
-    kernel = model.kernel
-    impedance = kernel.impedance
-    path = impedance.layout.path(x)
-    common, table = derivative_table(impedance.trajectory, path, path)
-    shared = same_label(x, x, impedance.layout.trajectory)
-    common = common if shared is None else common * shared
-    rows = [torch.cat([(common * table[i][j]).expand_as(common) for j in range(3)], dim=-1) for i in range(3)]
-    deviation = draw_gaussian(torch.cat(rows, dim=-2), generator)
-    desired = features.trajectory_mean[:, group : group + 1, :n] + torch.stack(
-        deviation.split(n, dim=-1), dim=-1
-    )
-    columns = [_draw_impedance(process, x, generator) for process in impedance.processes]
-    coupled = isinstance(kernel, CoupledInteractionKernel)
-    own = kernel.axis_residuals(x[0], x[0]) if coupled else kernel.residual_covariance(x, x)
-    residual = draw_gaussian(own, generator)
-    standard = torch.randn(residual.shape, generator=generator, dtype=residual.dtype)
-    noise = model.noise_variance.sqrt() * standard
-    parts = (desired, torch.stack(columns, dim=3), residual, noise)
-    return tuple(part[:, 0].numpy() for part in parts)  # type: ignore[return-value]
-
-
-def _draw_impedance(
-    process: ImpedanceProcess | CoupledProcess, x: Tensor, generator: torch.Generator
-) -> Tensor:
-    """One of k, d, m at the rows of `x` `(axes, 1, n, D)`: `(axes, 1, n)`, or `(axes, 1, n, axes)` of a matrix."""
-    if isinstance(process, CoupledProcess):
-        n = x.shape[-2]
-        covariance = process.gaussian_covariance(x[0], x[0])
-        draw = draw_gaussian(covariance.expand(*covariance.shape[:-2], n, n), generator)
-        return contract(process.dyads, process.levels[..., 0] * draw.exp()).movedim(1, -1)
-    draw = draw_gaussian(process.gaussian_covariance(x, x), generator)
-    level = process.level[..., 0]
-    return level + draw if process.law == "gaussian" else level * draw.exp()
 
 
 def _pace(time: Array, duration: float, generator: np.random.Generator) -> tuple[Array, Array, Array]:

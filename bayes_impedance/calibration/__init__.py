@@ -1,0 +1,1 @@
+"""Simulation-based calibration: whether a sampler draws from the posterior of its model."""
