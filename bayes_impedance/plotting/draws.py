@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +70,7 @@ def plot_drawn_impedance(posterior: DrawnPosterior, group: int = 0) -> Figure:
     )
     own = posterior.places_of(group)
     abscissa, name = posterior.abscissa(group)
+    pieces = posterior.pieces(group)
     prior = posterior.prior_impedance(PRIOR_DRAWS)
     said = {(one.verdict.latent, one.verdict.axis): one.verdict for one in posterior.verdicts}
     for row, latent in enumerate(IMPEDANCE_ORDER):
@@ -76,8 +78,12 @@ def plot_drawn_impedance(posterior: DrawnPosterior, group: int = 0) -> Figure:
         for column, (a, b) in enumerate(entries):
             ax = grid[row][column]
             low, high = np.quantile(prior[latent][:, own, a, b], [0.05, 0.95], axis=0)
-            ax.fill_between(abscissa, low, high, color=PRIOR, alpha=0.25, lw=0, label="prior, 90 %")
-            _band(ax, abscissa, matrices[..., a, b], "posterior")
+            for i, piece in enumerate(pieces):
+                label = None if i else "prior, 90 %"
+                ax.fill_between(
+                    abscissa[piece], low[piece], high[piece], color=PRIOR, alpha=0.25, lw=0, label=label
+                )
+            _band(ax, abscissa, matrices[..., a, b], "posterior", pieces)
             entry = f"{axes[a]}{axes[b]}"
             _truth(ax, posterior, group, f"{latent.value}_{entry}")
             title = f"{latent.value} {entry}"
@@ -87,7 +93,7 @@ def plot_drawn_impedance(posterior: DrawnPosterior, group: int = 0) -> Figure:
                 title += f": {verdict.support.value} (contraction {rounded(verdict.contraction)})"
             ax.set_title(title, fontsize=8)
             label_panel(ax, column, row, len(IMPEDANCE_ORDER), f"{latent.value} [{UNITS[latent]}]", name)
-    return finished(figure, grid, f"Impedance, drawn by {posterior.draws.method}")
+    return finished(figure, grid, _title("Impedance", posterior, group))
 
 
 def plot_drawn_trajectory(posterior: DrawnPosterior, group: int = 0) -> Figure:
@@ -98,15 +104,13 @@ def plot_drawn_trajectory(posterior: DrawnPosterior, group: int = 0) -> Figure:
     desired = posterior.of_group(posterior.at_places(Latent.DESIRED_POSITION), group)
     for a, axis in enumerate(axes):
         ax = grid[0][a]
-        for i, trial in enumerate(posterior.trials_of(group)):
-            hand = trial.time - trial.time[0] if trial.phase is None else trial.phase
-            order = np.argsort(hand)
+        for i, (trial, rows, place) in enumerate(posterior.courses(group)):
             label = "hand" if i == 0 else None
-            ax.plot(hand[order], trial.position[order, a], color=MEASURED, lw=0.6, alpha=0.6, label=label)
-        _band(ax, abscissa, desired[..., a], "desired")
+            ax.plot(place, trial.position[rows, a], color=MEASURED, lw=0.6, alpha=0.6, label=label)
+        _band(ax, abscissa, desired[..., a], "desired", posterior.pieces(group))
         _truth(ax, posterior, group, f"desired_position_{axis}")
         label_panel(ax, 0, 0, 1, f"{axis} [m]", name)
-    return finished(figure, grid, f"Desired trajectory, drawn by {posterior.draws.method}")
+    return finished(figure, grid, _title("Desired trajectory", posterior, group))
 
 
 def plot_drawn_force(posterior: DrawnPosterior) -> Figure:
@@ -122,7 +126,7 @@ def plot_drawn_force(posterior: DrawnPosterior) -> Figure:
         time = trials[column].time[rows[column]]
         for a, axis in enumerate(axes):
             ax = grid[a][column]
-            _band(ax, time, predicted[:, :, part, a], "predicted")
+            _band(ax, time, predicted[:, :, part, a], "predicted", [slice(None)])
             if measured is not None:
                 ax.plot(time, measured[part, a], ".", ms=2, color=MEASURED, label="measured")
             label_panel(ax, column, a, len(axes), f"force {axis} [N]", "time [s]")
@@ -156,6 +160,7 @@ def plot_confounding(posterior: DrawnPosterior) -> Figure:
         ax.plot(before, np.exp(np.log(prior[..., a, a]).mean(axis=1)), ".", ms=3, color=PRIOR, label="prior")
         ax.plot(sd[:, a], average, ".", ms=3, color=POSTERIOR, label="posterior")
         ax.set_xscale("log")
+        ax.xaxis.set_major_formatter("{x:g}")
         logarithmic(ax)
         known = "" if np.isnan(one.correlation) else f": correlation of logarithms {one.correlation:.2f}"
         ax.set_title(f"{axes[a]}{known}", fontsize=8)
@@ -163,17 +168,22 @@ def plot_confounding(posterior: DrawnPosterior) -> Figure:
     return finished(figure, grid, "What stiffness goes with")
 
 
-def _band(ax: Axes, abscissa: Array, draws: Array, name: str) -> None:
-    """Median and 90 % band of draws `(chains, draws, places)`."""
+def _title(what: str, posterior: DrawnPosterior, group: int) -> str:
+    named = f", group {posterior.groups[group]}" if len(posterior.groups) > 1 else ""
+    return f"{what}{named}, drawn by {posterior.draws.method}"
+
+
+def _band(ax: Axes, abscissa: Array, draws: Array, name: str, pieces: Sequence[slice]) -> None:
+    """Median and 90 % band of draws `(chains, draws, places)`, broken off between `pieces`."""
     low, middle, high = np.quantile(draws, [0.05, 0.5, 0.95], axis=(0, 1))
-    ax.fill_between(abscissa, low, high, color=POSTERIOR, alpha=0.3, lw=0)
-    ax.plot(abscissa, middle, color=POSTERIOR, lw=1.2, label=f"{name}, 90 % band")
+    for i, piece in enumerate(pieces):
+        label = None if i else f"{name}, 90 % band"
+        ax.fill_between(abscissa[piece], low[piece], high[piece], color=POSTERIOR, alpha=0.3, lw=0)
+        ax.plot(abscissa[piece], middle[piece], color=POSTERIOR, lw=1.2, label=label)
 
 
 def _truth(ax: Axes, posterior: DrawnPosterior, group: int, name: str) -> None:
-    for i, trial in enumerate(posterior.trials_of(group)):
+    for i, (trial, rows, place) in enumerate(posterior.courses(group)):
         if name in trial.truth:
-            at = trial.time - trial.time[0] if trial.phase is None else trial.phase
-            order = np.argsort(at)
             label = "truth" if i == 0 else None
-            ax.plot(at[order], trial.truth[name][order], "--", color=TRUTH, lw=0.8, label=label)
+            ax.plot(place, trial.truth[name][rows], "--", color=TRUTH, lw=0.8, label=label)

@@ -195,7 +195,9 @@ class JointDensity(SampledDensity):
             value = self.engine.log_likelihood_given_impedance(self.processes(values), impedance).sum()
         except ConfigurationError as error:
             # The processes were accepted at the medians: only the number of features can have grown.
-            raise NotPositiveDefiniteError(f"length scales became shorter than an engine holds: {error}") from error
+            raise NotPositiveDefiniteError(
+                f"length scales became shorter than an engine holds: {error}"
+            ) from error
         loop = self.features.loop
         if loop is None:
             return value

@@ -142,18 +142,35 @@ class DrawnPosterior:
 
     def abscissa(self, group: int) -> tuple[Array, str]:
         """Phase of the places of a group, or time of its only trial [s], else their number; and what it is."""
-        trials, samples = self.kept(self.places.places)
-        kept = [
-            (trial, rows)
-            for trial, rows in zip(trials, samples, strict=True)
-            if trial.group == self.groups[group]
-        ]
+        kept = self._kept_of(group)
         trial, rows = kept[0]
         if self.places.dimension == "phase" and trial.phase is not None:
             return trial.phase[rows], "phase"
         if len(kept) == 1:
             return trial.time[rows] - trial.time[0], "time [s]"
-        return np.arange(sum(len(own) for _, own in kept), dtype=np.float64), "sample"
+        return np.arange(sum(len(own) for _, own in kept), dtype=np.float64), "places of all trials"
+
+    def pieces(self, group: int) -> list[slice]:
+        """Which places of a group follow one another: those of each trial, or all."""
+        ends = np.cumsum([len(rows) for _, rows in self._kept_of(group)])
+        return [
+            slice(end - len(rows), end) for end, (_, rows) in zip(ends, self._kept_of(group), strict=True)
+        ]
+
+    def courses(self, group: int) -> list[tuple[PreparedTrial, Integers, Array]]:
+        """Trials of a group, and samples of each with their values of the `abscissa`."""
+        if self.places.dimension == "phase":
+            trials = [(trial, trial.phase) for trial in self.trials_of(group) if trial.phase is not None]
+            orders = [np.argsort(phase, kind="stable") for _, phase in trials]
+            return [
+                (trial, order, phase[order]) for (trial, phase), order in zip(trials, orders, strict=True)
+            ]
+        kept = self._kept_of(group)
+        if len(kept) == 1:
+            trial = kept[0][0]
+            return [(trial, np.arange(trial.n_samples), trial.time - trial.time[0])]
+        numbers = [np.arange(piece.start, piece.stop, dtype=np.float64) for piece in self.pieces(group)]
+        return [(trial, rows, own) for (trial, rows), own in zip(kept, numbers, strict=True)]
 
     def prior_impedance(self, draws: int) -> dict[Latent, Array]:
         """Draws of K, D and M at the places before any force, `(draws, places, axes, axes)` [unit of each]."""
@@ -166,6 +183,11 @@ class DrawnPosterior:
                 found.append(self.density.impedance(values, self.target)[groups, rows].numpy())
         stacked = np.stack(found)
         return {latent: stacked[:, :, j] for latent, j in IMPEDANCE_ORDER.items()}
+
+    def _kept_of(self, group: int) -> list[tuple[PreparedTrial, Integers]]:
+        """Motions of a group that have places, and these."""
+        pairs = zip(*self.kept(self.places.places), strict=True)
+        return [(trial, rows) for trial, rows in pairs if trial.group == self.groups[group]]
 
     def _at_places(self, values: Array) -> Array:
         """Values `(draws, groups, m, …)` at the places, by chain, and by group where all have the same phases."""

@@ -116,8 +116,8 @@ def _at_phase(trial: PreparedTrial, name: str, phase: Array) -> Array:
     values = np.asarray(getattr(trial, name))
     # Noise lets phase go back for a sample or two.
     order = np.argsort(_phase(trial), kind="stable")
-    known, columns = _phase(trial)[order], values[order].reshape(len(values), -1).T
-    columns = [np.interp(phase, known, column) for column in columns]
+    known, values = _phase(trial)[order], values[order]
+    columns = [np.interp(phase, known, column) for column in values.reshape(len(values), -1).T]
     return np.stack(columns, axis=-1).reshape(len(phase), *values.shape[1:])
 
 

@@ -48,7 +48,12 @@ def test_names_dimensions_and_units(case):
         assert data[latent.value].attrs["verdict_sentence"] == [verdict.sentence for verdict in said]
         assert len(said) == 2
     units = {"stiffness": "N/m", "damping": "Ns/m", "mass": "kg", "desired_position": "m"}
-    units |= {"desired_velocity": "m/s", "desired_acceleration": "m/s^2", "residual_force": "N", "noise_sd": "N"}
+    units |= {
+        "desired_velocity": "m/s",
+        "desired_acceleration": "m/s^2",
+        "residual_force": "N",
+        "noise_sd": "N",
+    }
     assert {name: data[name].attrs["units"] for name in units} == units
     assert data["desired_position"].dims == (*place, "axis")
     assert data["residual_force"].dims == (*FIRST, "sample", "axis")
@@ -110,7 +115,9 @@ def test_the_file_holds_the_same(case, tmp_path):
                 assert tree[name][variable].attrs["units"] == group[variable].attrs["units"]
         said = tree["posterior"]["stiffness"].attrs
         assert list(said["verdict"]) == [one.verdict.support.value for one in posterior.verdicts[:2]]
-        np.testing.assert_allclose(said["contraction"], [one.verdict.contraction for one in posterior.verdicts[:2]])
+        np.testing.assert_allclose(
+            said["contraction"], [one.verdict.contraction for one in posterior.verdicts[:2]]
+        )
         about = tree.attrs
         assert about["method"] == "nuts" and about["engine"] == str(posterior.engine)
         assert json.loads(about["diagnosis"]) == json.loads(json.dumps(posterior.diagnosis.as_dict()))

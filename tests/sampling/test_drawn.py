@@ -98,8 +98,23 @@ def test_what_is_plotted_against_what():
     time, name = drawn("time").abscissa(0)
     assert name == "time [s]" and time[0] == 0.0 and len(time) == PLACES
     number, name = drawn("times").abscissa(0)
-    assert name == "sample" and len(number) == 3 * PLACES == len(drawn("times").places_of(0))
+    assert name == "places of all trials" and len(number) == 3 * PLACES == len(drawn("times").places_of(0))
     assert drawn("times").abscissa(1)[0].shape == (2 * PLACES,)
+    # Bands break off between trials, and what is known of these stands at the same places.
+    pieces = drawn("times").pieces(0)
+    assert [(piece.start, piece.stop) for piece in pieces] == [(0, 9), (9, 18), (18, 27)]
+    for piece, (trial, rows, place) in zip(pieces, drawn("times").courses(0), strict=True):
+        np.testing.assert_array_equal(place, number[piece])
+        assert trial.group == "b" and len(rows) == PLACES and rows[-1] == trial.n_samples - 1
+    ((trial, rows, place),) = drawn("time").courses(0)
+    np.testing.assert_array_equal(place, trial.time - trial.time[0])
+    assert len(rows) == trial.n_samples and drawn("time").pieces(0) == [slice(0, PLACES)]
+    for (trial, rows, place), expected in zip(
+        drawn("groups").courses(1), drawn("groups").trials_of(1), strict=True
+    ):
+        assert trial is expected
+        np.testing.assert_array_equal(place, np.sort(trial.phase))
+        np.testing.assert_array_equal(trial.phase[rows], place)
 
 
 def test_a_constant_is_told_once_for_each_group():
@@ -113,7 +128,9 @@ def test_a_constant_is_told_once_for_each_group():
         first = drawn(case).first_place(mass)
         assert first.shape == (CHAINS, DRAWS, 2, 2, 2)
         for group in (0, 1):
-            np.testing.assert_allclose(first[:, :, group], mass[:, :, drawn(case).places_of(group)[1]], rtol=1e-12)
+            np.testing.assert_allclose(
+                first[:, :, group], mass[:, :, drawn(case).places_of(group)[1]], rtol=1e-12
+            )
 
 
 @pytest.mark.parametrize("case", CASES)

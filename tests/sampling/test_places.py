@@ -47,7 +47,10 @@ def test_layout_follows_the_desired_trajectory(case):
         is_average = trial.name == f"average motion of {trial.group}"
         np.testing.assert_array_equal(forces, np.arange(0 if is_average else trial.n_samples))
         if is_average or not averages:
-            assert len(kept) == min(PLACES, trial.n_samples) and (kept[0], kept[-1]) == (0, trial.n_samples - 1)
+            assert len(kept) == min(PLACES, trial.n_samples) and (kept[0], kept[-1]) == (
+                0,
+                trial.n_samples - 1,
+            )
         else:
             assert len(kept) == 0
 
@@ -88,7 +91,10 @@ def test_repetitions_inside_one_trial_are_those_of_as_many_trials():
 
 def test_what_was_broken_off_does_not_shorten_the_phase():
     log = repeated_motion(3, 2.0, 20.0, axes=("x",), seed=1)
-    broken = [replace(cut(log.trials[0], 0.0, 0.3), name="early"), replace(cut(log.trials[1], 0.6, 1.0), name="late")]
+    broken = [
+        replace(cut(log.trials[0], 0.0, 0.3), name="early"),
+        replace(cut(log.trials[1], 0.6, 1.0), name="late"),
+    ]
     more = PreparedLog(log.axes, (*log.trials, *broken))
     assert common_phase(more) == common_phase(log)
     phase = np.linspace(*common_phase(log), 6)

@@ -139,7 +139,8 @@ def test_logs_without_what_it_takes():
         fitted().sample(without_force(one), "log", LAPLACE)
     both = PreparedLog(one.axes, (*one.trials, *without_force(other).trials))
     with pytest.raises(
-        LogError, match="expected forces of every group to sample from, found none of group 'other'; name a log"
+        LogError,
+        match="expected forces of every group to sample from, found none of group 'other'; name a log",
     ):
         model_of(*SMALL).sample(both, settings=LAPLACE)
     with pytest.raises(LogError, match="expected a log with axes x"):
@@ -207,7 +208,9 @@ def test_coupled_axes_of_two_groups_with_residual_and_offset():
 )
 def test_a_device_that_answers_force(name, overrides):
     person = Subject("low", arm_with("low"), Pace(repetition=2.0))
-    log = simulate(Experiment([person], FigureEight(), repetitions=2, perturbation=BandLimitedForce(8.0)), seed=1)
+    log = simulate(
+        Experiment([person], FigureEight(), repetitions=2, perturbation=BandLimitedForce(8.0)), seed=1
+    )
     few = ("preprocessing.rate=8", "engine.inducing=2", "model.desired_trajectory.average_knots=4")
     few += ("training.max_iterations=30",)
     model = model_of(*few, *overrides, name=name)
@@ -231,13 +234,14 @@ def test_draws_are_about_laplace_s_posterior_in_map_mode():
     for latent in (Latent.STIFFNESS, Latent.DAMPING, Latent.MASS):
         marginal = posterior[latent]
         low, middle, high = (
-            np.interp(phase, trial.phase, marginal.quantile(p)[: trial.n_samples, 0]) for p in (0.05, 0.5, 0.95)
+            np.interp(phase, trial.phase, marginal.quantile(p)[: trial.n_samples, 0])
+            for p in (0.05, 0.5, 0.95)
         )
         drawn = found.matrices(latent)[..., 0, 0].reshape(400, -1)
         q05, q50, q95 = np.quantile(drawn, [0.05, 0.5, 0.95], axis=0)
         assert np.abs((q50 - middle) / (high - low)).max() < 0.35, latent
         ratio = (q95 - q05) / (high - low)
-        assert 0.5 < ratio.min() and ratio.max() < 2.0, (latent, ratio)
+        assert ratio.min() > 0.5 and ratio.max() < 2.0, (latent, ratio)
 
 
 def test_length_scales_that_no_engine_holds_are_where_the_density_ends():
@@ -247,7 +251,7 @@ def test_length_scales_that_no_engine_holds_are_where_the_density_ends():
     point = np.zeros(density.size)
     at = sum(p.size for p in density.parameters[: names.index("desired_trajectory_length_scale")])
     point[at] = -14.0
-    with pytest.raises(NotPositiveDefiniteError, match="length scales became shorter than an engine holds: the low-rank"):
+    with pytest.raises(NotPositiveDefiniteError, match="length scales became shorter than an engine holds"):
         density.joint(point)
 
 
@@ -258,5 +262,7 @@ def test_a_density_that_overflows_says_what_to_look_at():
 
     density = Overflowing(1, np.ones(2, dtype=bool))
     assert density.joint(np.zeros(2))[0] == 2.0
-    with pytest.raises(NotPositiveDefiniteError, match="expected a finite posterior density, found one that overflows"):
+    with pytest.raises(
+        NotPositiveDefiniteError, match="expected a finite posterior density, found one that overflows"
+    ):
         density.joint(np.full(2, 1e3))
