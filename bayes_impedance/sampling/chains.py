@@ -87,7 +87,7 @@ def checked(checkpoint: Checkpoint, settings: SamplingConfig) -> Checkpoint:
     """With the settings among what it is of; sooner than in a process of a chain, whose refusal would be a chain lost.
 
     Raises:
-        OutputError: a checkpoint is damaged, or of another model, other data or other settings.
+        OutputError: see `sample_nuts`.
     """
     named = replace(checkpoint, fingerprint={**checkpoint.fingerprint, **fingerprint(settings)})
     for number in range(settings.chains):

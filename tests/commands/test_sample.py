@@ -189,7 +189,7 @@ def test_ctrl_c_while_nothing_is_kept_or_all_is(command, bench, tmp_path, monkey
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (("--out", "posterior.csv"), "posterior.csv: expected a file name that ends in .nc (netCDF), got '.csv'; name one"),
+        (("--out", "posterior.csv"), "expected a file name that ends in .nc (netCDF), got '.csv'; name one"),
         (("--out", "posterior"), "expected a file name that ends in .nc (netCDF), got ''"),
         (("--out", "missing/posterior.nc"), "expected an existing folder"),
         (("--out", "folder.nc"), "expected a file name to write to, found a folder"),

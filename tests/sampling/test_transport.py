@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 import torch
+from scipy.special import logsumexp
 
 from bayes_impedance.config import SamplingConfig
 from bayes_impedance.impedance_functions import laplace
 from bayes_impedance.impedance_functions.function import choose_inducing
 from bayes_impedance.sampling.density import JointDensity
-from bayes_impedance.sampling.importance import laplace_draws
+from bayes_impedance.sampling.importance import log_densities, log_t, proposals
+from bayes_impedance.sampling.nuts import Chain
 from bayes_impedance.sampling.parameters import QUANTITIES
 from bayes_impedance.sampling.sample import draw
 from bayes_impedance.sampling.start import find_start
@@ -146,14 +148,41 @@ def test_of_a_quadratic_likelihood_weights_are_standard_normal_at_any_hyperparam
     assert size > count
 
 
-def test_draws_are_those_of_plain_coordinates():
+def weighted(density, start, count=1000):
+    """Mean of the standard coordinates and log of the integral, by importance sampling about a mode."""
+    steps = proposals(count, density.size, np.random.default_rng(1))
+    places = start.at(steps)
+    log_ratios = log_densities(density, places) - log_t(steps) + np.linalg.slogdet(start.root)[1]
+    weights = np.exp(log_ratios - logsumexp(log_ratios))
+    return places, weights, logsumexp(log_ratios) - np.log(count)
+
+
+def test_integral_and_means_are_those_of_plain_coordinates():
     few = ("model.stiffness.log_sd={median: 0.3, log_sd: 0.5}", "model.damping.input=[]")
     problem = small_problem(*MARKOV, *few, *DISTINCT, "engine.inducing=2", axes=("x",), repetitions=3)
     inducing = choose_inducing(problem.config, problem.model, problem.features)
     density = JointDensity(problem.config, problem.model, problem.features, inducing)
-    settings = SamplingConfig(method="laplace", draws=800, chains=1, seed=1)
-    plain = laplace_draws(density, find_start(density, problem.config.training), settings)
-    found = draw(density, problem.config.training, settings)
-    assert max(plain.pareto_k, found.pareto_k) < 0.7
-    np.testing.assert_allclose(found.standard[0].mean(0), plain.standard[0].mean(0), atol=0.2)
-    np.testing.assert_allclose(found.standard[0].std(0), plain.standard[0].std(0), rtol=0.2)
+    plain, weights, integral = weighted(density, find_start(density, problem.config.training))
+    transported = TransportedDensity(density)
+    places, others, other = weighted(transported, find_start(transported, problem.config.training))
+    assert integral == pytest.approx(other, abs=0.3)
+    found = transported.all_standard(places)
+    np.testing.assert_allclose(others @ found, weights @ plain, atol=0.25)
+    assert abs(float(transported.standard(torch.from_numpy(places[0]))[1])) > 1.0
+
+
+def test_what_sampling_returns_is_in_standard_coordinates():
+    density = density_of("one axis")
+    settings = SamplingConfig(warmup=20, draws=2, chains=1)
+    found = draw(density, density.config.training, settings)
+    transported = TransportedDensity(density)
+    start = find_start(transported, density.config.training)
+    chain = Chain(transported, start, settings, 0)
+    while chain.done < chain.total:
+        chain.advance()
+    np.testing.assert_array_equal(found.standard[0], transported.all_standard(chain.standard))
+    for lp, standard, place in zip(found.stats["lp"][0], found.standard[0], chain.standard, strict=True):
+        jacobian = float(transported.standard(torch.from_numpy(place))[1])
+        assert lp == pytest.approx(
+            float(density.log_density(torch.from_numpy(standard))) + jacobian, rel=1e-9
+        )
