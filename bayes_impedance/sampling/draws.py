@@ -21,8 +21,8 @@ class Draws:
     """Coordinates `standard` `(chains, draws, size)` of a `JointDensity`.
 
     `stats`: by name, `(chains, draws)` each: for nuts those of a `Chain`, for approximations the log density alone.
-    `pareto_k` is the shape of the tail of their importance ratios, None for nuts;
-    `lost` says of each chain that died with what; `remarks` are what else a reader should know of how they were drawn.
+    `pareto_k` is the shape of the tail of their importance ratios, None for nuts; `lost` says of each chain that died
+    with what; `remarks` are what else a reader should know of how they were drawn.
     """
 
     method: SamplingMethod

@@ -8,11 +8,10 @@ from scipy.special import logsumexp
 from bayes_impedance.config import SamplingConfig
 from bayes_impedance.impedance_functions import laplace
 from bayes_impedance.impedance_functions.function import choose_inducing
+from bayes_impedance.sampling import sample as module
 from bayes_impedance.sampling.density import JointDensity
 from bayes_impedance.sampling.importance import log_densities, log_t, proposals
-from bayes_impedance.sampling.nuts import Chain
 from bayes_impedance.sampling.parameters import QUANTITIES
-from bayes_impedance.sampling.sample import draw
 from bayes_impedance.sampling.start import find_start
 from bayes_impedance.sampling.transport import TransportedDensity
 from tests.impedance_functions.problems import COUPLED, DISTINCT, KNOWN_VARIATION, MARKOV, small_problem
@@ -148,6 +147,13 @@ def test_of_a_quadratic_likelihood_weights_are_standard_normal_at_any_hyperparam
     assert size > count
 
 
+def few_coordinates():
+    few = ("model.stiffness.log_sd={median: 0.3, log_sd: 0.5}", "model.damping.input=[]")
+    problem = small_problem(*MARKOV, *few, *DISTINCT, "engine.inducing=2", axes=("x",), repetitions=3)
+    inducing = choose_inducing(problem.config, problem.model, problem.features)
+    return JointDensity(problem.config, problem.model, problem.features, inducing)
+
+
 def weighted(density, start, count=1000):
     """Mean of the standard coordinates and log of the integral, by importance sampling about a mode."""
     steps = proposals(count, density.size, np.random.default_rng(1))
@@ -158,31 +164,28 @@ def weighted(density, start, count=1000):
 
 
 def test_integral_and_means_are_those_of_plain_coordinates():
-    few = ("model.stiffness.log_sd={median: 0.3, log_sd: 0.5}", "model.damping.input=[]")
-    problem = small_problem(*MARKOV, *few, *DISTINCT, "engine.inducing=2", axes=("x",), repetitions=3)
-    inducing = choose_inducing(problem.config, problem.model, problem.features)
-    density = JointDensity(problem.config, problem.model, problem.features, inducing)
-    plain, weights, integral = weighted(density, find_start(density, problem.config.training))
+    density = few_coordinates()
+    plain, weights, integral = weighted(density, find_start(density, density.config.training))
     transported = TransportedDensity(density)
-    places, others, other = weighted(transported, find_start(transported, problem.config.training))
+    places, others, other = weighted(transported, find_start(transported, density.config.training))
     assert integral == pytest.approx(other, abs=0.3)
     found = transported.all_standard(places)
     np.testing.assert_allclose(others @ found, weights @ plain, atol=0.25)
     assert abs(float(transported.standard(torch.from_numpy(places[0]))[1])) > 1.0
 
 
-def test_what_sampling_returns_is_in_standard_coordinates():
-    density = density_of("one axis")
-    settings = SamplingConfig(warmup=20, draws=2, chains=1)
-    found = draw(density, density.config.training, settings)
-    transported = TransportedDensity(density)
-    start = find_start(transported, density.config.training)
-    chain = Chain(transported, start, settings, 0)
-    while chain.done < chain.total:
-        chain.advance()
-    np.testing.assert_array_equal(found.standard[0], transported.all_standard(chain.standard))
-    for lp, standard, place in zip(found.stats["lp"][0], found.standard[0], chain.standard, strict=True):
-        jacobian = float(transported.standard(torch.from_numpy(place))[1])
-        assert lp == pytest.approx(
-            float(density.log_density(torch.from_numpy(standard))) + jacobian, rel=1e-9
-        )
+def test_what_sampling_returns_is_in_standard_coordinates(monkeypatch):
+    density, seen = few_coordinates(), []
+
+    def watched(own, *arguments, **named):
+        seen.append(own)
+        return find_start(own, *arguments, **named)
+
+    monkeypatch.setattr(module, "find_start", watched)
+    found = module.draw(density, density.config.training, SamplingConfig(warmup=20, draws=3, chains=1))
+    (transported,) = seen
+    for lp, standard in zip(found.stats["lp"][0], found.standard[0], strict=True):
+        place = torch.from_numpy(standard)
+        # Hyperparameters are the same in both, and all that the Jacobian depends on.
+        jacobian = float(transported.standard(place)[1])
+        assert lp == pytest.approx(float(density.log_density(place)) + jacobian, rel=1e-9)
