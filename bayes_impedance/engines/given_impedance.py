@@ -147,4 +147,4 @@ def diagonal_only(impedance: Tensor) -> Tensor:
 
 def as_read(impedance: Tensor, coupled: bool) -> Tensor:
     """The matrices as an engine reads them: only diagonals where axes do not couple."""
-    return impedance if coupled else diagonal_only(impedance)
+    return impedance if coupled or impedance.shape[-1] == 1 else diagonal_only(impedance)

@@ -209,7 +209,7 @@ class JointDensity(SampledDensity):
         Raises:
             NotPositiveDefiniteError: see `log_likelihood`.
         """
-        return self.log_likelihood(self.values(coordinates)) - 0.5 * coordinates.square().sum()
+        return self.log_likelihood(self.values(coordinates)) - 0.5 * coordinates @ coordinates
 
     def is_constant(self, quantity: int) -> bool:
         """Whether K, D or M (0, 1, 2) does not depend on an input."""

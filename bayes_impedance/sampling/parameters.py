@@ -37,15 +37,8 @@ class Parameter:
         """Number of coordinates."""
         return int(torch.Size(self.shape).numel())
 
-    def value(self, standard: Tensor) -> Tensor:
-        """What coordinates `(..., size)` stand for, `(..., *shape)` [its units]."""
-        z = standard.reshape(*standard.shape[:-1], *self.shape)
-        if self.median is None or self.log_sd is None:
-            return z
-        return self.median * torch.exp(self.log_sd * z)
-
     def standard(self, value: Tensor) -> Tensor:
-        """The inverse of `value`, `(..., size)`."""
+        """Coordinates `(..., size)` of values `(..., *shape)` [its units]."""
         z = (
             value
             if self.median is None or self.log_sd is None

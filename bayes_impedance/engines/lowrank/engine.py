@@ -150,12 +150,15 @@ class LowRankEngine:
         def rows(batch: Batch) -> Rows:
             weight = batch.valid / deviation
             x = batch.take(self.features.inputs)
+            residual = design.residual(x)
+            if residual.shape[-1]:
+                residual = residual * design.rows(weight.expand(x.shape[:-1])).unsqueeze(-1)
             own, shared = design.split(
                 # Rows of W over the σ_r of their axis.
                 design.force(
                     x, impedance[batch.group, batch.index] * weight.permute(1, 2, 0)[:, :, None, :, None]
                 ),
-                design.residual(x) * design.rows(weight.expand(x.shape[:-1])).unsqueeze(-1),
+                residual,
             )
             return Rows(own, shared, design.rows(batch.take(misfit) * weight))
 

@@ -94,9 +94,9 @@ def counts(kernel: Stationary, extents: Sequence[Extent], axes: int, accuracy: A
 
 def products(kernel: Stationary, extents: Sequence[Extent], axes: int, accuracy: Accuracy) -> Tensor | None:
     """Products of waves that matter, Σ_d (ω_d ℓ_d)² within the cutoff, `(features, p)`; None for a scalar θ."""
-    needed = counts(kernel, extents, axes, accuracy)
-    if len(needed) == 1:
+    if len(extents) == 1:
         return None
+    needed = counts(kernel, extents, axes, accuracy)
     indices = torch.cartesian_prod(*(torch.arange(count) for count in needed))
     scales = length_scales(kernel, axes).detach()[:, 0, 0]
     half = torch.tensor([extent.half for extent in extents], dtype=scales.dtype)

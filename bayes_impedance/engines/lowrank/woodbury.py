@@ -107,10 +107,10 @@ class _Reduced(NamedTuple):
 
 def _eliminate(make: Callable[[], Rows]) -> _Reduced:
     own, shared, force = make()
-    factor = _cholesky(own.mT @ own)
     if own.shape[-1] == 0:
         none = own.mT @ shared
-        return _Reduced(shared.flatten(-3, -2), force.flatten(-2), Own(factor, none, none.sum(-1)))
+        return _Reduced(shared.flatten(-3, -2), force.flatten(-2), Own(own.mT @ own, none, none.sum(-1)))
+    factor = _cholesky(own.mT @ own)
     right = torch.cat([shared, force.unsqueeze(-1)], dim=-1)
     fit = torch.cholesky_solve(own.mT @ right, factor)
     left = torch.cat([right - own @ fit, -fit], dim=-2).flatten(-3, -2)

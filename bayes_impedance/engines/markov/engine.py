@@ -169,7 +169,9 @@ class MarkovEngine:
 
     def _product(self, matrices: Tensor, errors: Tensor) -> Tensor:
         """Σ_j W_j e_j, `(n, axes)` [N], of `errors` `(n, axes, 3)`."""
-        return torch.einsum("njab,nbj->na" if self.coupled else "nja,naj->na", matrices, errors)
+        if self.coupled:
+            return torch.einsum("njab,nbj->na", matrices, errors)
+        return (matrices * errors.mT).sum(1)
 
     def _joined(self, target: Features) -> Joined:
         """With the samples of `target`, which one call after another has in common."""
