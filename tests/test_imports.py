@@ -194,6 +194,7 @@ SAMPLING = (
     "sampling.diagnosis",
     "sampling.diagnostics",
     "sampling.latents",
+    "sampling.impedance_draws",
     "sampling.places",
     "sampling.support",
     "sampling.drawn",

@@ -19,6 +19,7 @@ from bayes_impedance.preprocessing import PreparedLog, PreparedTrial
 from bayes_impedance.sampling.density import JointDensity
 from bayes_impedance.sampling.diagnosis import Diagnosis
 from bayes_impedance.sampling.draws import Draws
+from bayes_impedance.sampling.impedance_draws import draw_impedance
 from bayes_impedance.sampling.parameters import Parameter
 from bayes_impedance.sampling.places import Places
 from bayes_impedance.sampling.support import ExactVerdict
@@ -175,14 +176,9 @@ class DrawnPosterior:
     def prior_impedance(self, draws: int) -> dict[Latent, Array]:
         """Draws of K, D and M at the places before any force, `(draws, places, axes, axes)` [unit of each]."""
         groups, rows = self._index(self.places.places)
-        generator = np.random.default_rng(PRIOR_SEED)
-        found = []
-        with torch.no_grad():
-            for z in generator.standard_normal((draws, self.density.size)):
-                values = self.density.values(torch.from_numpy(z))
-                found.append(self.density.impedance(values, self.target)[groups, rows].numpy())
-        stacked = np.stack(found)
-        return {latent: stacked[:, :, j] for latent, j in IMPEDANCE_ORDER.items()}
+        standard = np.random.default_rng(PRIOR_SEED).standard_normal((draws, self.density.size))
+        found = draw_impedance(self.density, standard, self.target, PRIOR_SEED)
+        return {latent: values[:, groups, rows] for latent, values in found.items()}
 
     def _kept_of(self, group: int) -> list[tuple[PreparedTrial, Integers]]:
         """Motions of a group that have places, and these."""

@@ -29,6 +29,7 @@ from bayes_impedance.sampling.density import JointDensity
 from bayes_impedance.sampling.diagnostics import diagnose
 from bayes_impedance.sampling.drawn import DrawnPosterior
 from bayes_impedance.sampling.draws import Draws, Progress
+from bayes_impedance.sampling.impedance_draws import draw_impedance
 from bayes_impedance.sampling.importance import laplace_draws
 from bayes_impedance.sampling.latents import draw_latents
 from bayes_impedance.sampling.parameters import QUANTITIES
@@ -95,6 +96,7 @@ def sample_posterior(
     draws = draw(density, config.training, settings, hook, kept)
     standard = draws.standard.reshape(-1, density.size)
     latents = draw_latents(density, standard, target, settings.seed, _drawing(hook))
+    latents |= draw_impedance(density, standard, target, settings.seed)
     diagnosis = diagnose(draws, names_of_coordinates(density.parameters, log.axes), settings.max_tree_depth)
     unsaid = DrawnPosterior(config, density, draws, places, target, latents, diagnosis, ())
     return _with_verdicts(unsaid, problem)
