@@ -1,5 +1,7 @@
 """A posterior by its draws: latents, values and names where they belong, whatever the layout."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -18,6 +20,9 @@ def test_impedance_at_the_places_is_that_of_each_draw_at_their_inputs(case):
     feature_map = FeatureMap(posterior.config, posterior.axes)
     mean = TrajectoryMean.from_training(posterior.config.model.desired_trajectory, posterior.log)
     trials, rows = posterior.kept(posterior.places.places)
+    known = carried(posterior)
+    latents = {latent: known[:, :, :, j] for latent, j in IMPEDANCE_ORDER.items()}
+    posterior = replace(posterior, latents={**posterior.latents, **latents})
     matrices = {latent: posterior.matrices(latent) for latent in IMPEDANCE_ORDER}
     is_phase = posterior.places.dimension == "phase"
     seen = 0
@@ -66,10 +71,22 @@ def test_forces_are_those_at_the_samples_of_each_trial(case):
     assert posterior.recorded("smoothing") is None
 
 
+def carried(posterior):
+    """K, D and M of each draw as their inducing inputs carry them, `(draws, groups, m, 3, axes, axes)`."""
+    density = posterior.density
+    with torch.no_grad():
+        found = [
+            density.impedance(density.values(row), posterior.target).numpy()
+            for row in torch.from_numpy(posterior.draws.standard).flatten(0, 1)
+        ]
+    return np.stack(found)
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_a_draw_is_one_whole(case):
-    """Desired trajectory, impedance and residual of a draw at a sample give the force there, but for noise."""
+    """Desired trajectory, carried impedance and residual of a draw at a sample give the force there, but for noise."""
     posterior = drawn(case)
+    impedance = carried(posterior)
     names = [trial.name for trial in posterior.places.log.trials]
     noise = posterior.values()["noise_sd"].reshape(CHAINS * DRAWS, 2)
     scores = []
@@ -85,7 +102,8 @@ def test_a_draw_is_one_whole(case):
                 strict=True,
             ):
                 error = posterior.latents[desired][:, :, g, 7 * at] - own[sample]
-                total += np.einsum("dab,db->da", posterior.latents[latent][:, g, 7 * at], error)
+                matrices = impedance[:, g, 7 * at, IMPEDANCE_ORDER[latent]]
+                total += np.einsum("dab,db->da", matrices, error)
             scores.append((posterior.latents[Latent.FORCE][:, :, g, 7 * at] - total) / noise)
     scores = np.stack(scores)
     assert len(names) == len(set(names))
