@@ -35,6 +35,20 @@ def check_writable(path: Path) -> None:
         ) from error
 
 
+def check_file(path: Path) -> None:
+    """Refuse a place where no file can be written.
+
+    Raises:
+        OutputError: as `check_writable`, or something that is no file stands there.
+    """
+    check_writable(path)
+    if path.is_dir():
+        raise OutputError(f"{path}: expected a file name to write to, found a folder; name a file in it")
+    if path.exists() and not path.is_file():
+        # Renaming over /dev/null would remove it.
+        raise OutputError(f"{path}: expected a file name to write to, found a device or pipe; name a file")
+
+
 def prepare_folder(folder: Path) -> None:
     """Make a folder that files are to go into, where there is none.
 
@@ -56,12 +70,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises:
         OutputError: the file cannot be written.
     """
-    check_writable(path)
-    if path.is_dir():
-        raise OutputError(f"{path}: expected a file name to write to, found a folder; name a file in it")
-    if path.exists() and not path.is_file():
-        # Renaming over /dev/null would remove it.
-        raise OutputError(f"{path}: expected a file name to write to, found a device or pipe; name a file")
+    check_file(path)
     target = path.resolve()
     handle, name = tempfile.mkstemp(prefix=f".{target.stem}-", suffix=target.suffix, dir=target.parent)
     os.close(handle)

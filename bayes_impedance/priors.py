@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import gpytorch
@@ -79,7 +80,7 @@ class Entry:
         shape = (*self.raw.shape[:1], 1, 1, len(self.specs))
         return self.constraint.transform(self.raw).reshape(shape) ** self.power
 
-    @property
+    @cached_property
     def free(self) -> Tensor:
         """True for components that are learned."""
         return torch.tensor([not spec.fixed for spec in self.specs])
@@ -94,12 +95,12 @@ class Entry:
             inner.expand(self.raw.shape[0], 1, 1, -1).reshape(self.raw.shape)
         )
 
-    @property
+    @cached_property
     def medians(self) -> Tensor:
         """Medians of the hyperprior, `(components,)`."""
         return torch.tensor([spec.median for spec in self.specs], dtype=self.raw.dtype)
 
-    @property
+    @cached_property
     def log_sds(self) -> Tensor:
         """Log-SD of the hyperprior, `(components,)`."""
         return torch.tensor([spec.log_sd for spec in self.specs], dtype=self.raw.dtype)

@@ -72,8 +72,11 @@ def sampling_progress(console: Console) -> Iterator[SamplingHook]:
 
         def hook(what: str, done: int, total: int, state: str) -> None:
             if what not in tasks:
-                tasks[what] = bar.add_task(what, total=total or None, state="")
-            bar.update(tasks[what], completed=done, state=state)
+                # What came before has ended, but for other chains.
+                for name, task in tasks.items():
+                    bar.update(task, visible=name.startswith("chain") and what.startswith("chain"))
+                tasks[what] = bar.add_task(what, total=None, state="")
+            bar.update(tasks[what], completed=done, total=total or None, state=state)
 
         yield hook
 
@@ -159,20 +162,25 @@ def print_exact_verdicts(console: Console, posterior: DrawnPosterior) -> None:
     console.print(verdict_table(verdicts, posterior.off_diagonals))
     _print_sentences(console, verdicts, caveat(verdicts, posterior.log, posterior.config))
     for one in posterior.verdicts:
-        if one.verdict.latent is Latent.STIFFNESS and not np.isnan(one.correlation):
-            console.print(
-                f"  stiffness {2 * one.verdict.axis}: correlation {one.correlation:.2f} with the SD of the desired "
-                f"trajectory, sensitivity to its prior {one.sensitivity:.2f}",
-                highlight=False,
+        known = [
+            f"{name} {value:.2f}"
+            for name, value in (
+                ("correlation with the SD of the desired trajectory", one.correlation),
+                ("sensitivity to its prior", one.sensitivity),
             )
+            if not np.isnan(value)
+        ]
+        if one.verdict.latent is Latent.STIFFNESS and known:
+            console.print(f"  stiffness {2 * one.verdict.axis}: {', '.join(known)}", highlight=False)
 
 
 def print_diagnosis(console: Console, posterior: DrawnPosterior) -> None:
     """What draws are worth, and what to do where they are not."""
     diagnosis = posterior.diagnosis
-    console.print(diagnosis.summary, highlight=False)
+    console.print(diagnosis.summary, highlight=False, markup=False)
     for finding in diagnosis.findings:
-        console.print(f"  {finding}", style="yellow", highlight=False)
+        # What chains died of may stand in brackets.
+        console.print(f"  {finding}", style="yellow", highlight=False, markup=False)
 
 
 def _print_sentences(console: Console, verdicts: Sequence[Verdict], remark: str | None) -> None:

@@ -55,6 +55,7 @@ def test_commands_run_in_the_order_shown(place: Path) -> None:
         "inspect",
         "train",
         "infer",
+        "sample",
         "evaluate",
         "evaluate",
         "show",

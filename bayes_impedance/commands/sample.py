@@ -12,7 +12,7 @@ from rich.console import Console
 from bayes_impedance import terminal
 from bayes_impedance.config import Config, SamplingConfig, override_config
 from bayes_impedance.errors import ConfigurationError, OutputError
-from bayes_impedance.outputs import check_writable, prepare_folder
+from bayes_impedance.outputs import check_file, check_writable, prepare_folder
 from bayes_impedance.persistence import load_model
 from bayes_impedance.plotting.draws import save_draw_figures
 from bayes_impedance.readers import read_log
@@ -77,27 +77,23 @@ def sample_command(
     and ends with the same draws. Diagnostics are printed with advice, and kept in the file.
     """
     console = Console()
-    if out.suffix != SUFFIX:
-        raise OutputError(
-            f"{out}: expected a file name that ends in {SUFFIX} (netCDF), got {out.suffix!r}; name one"
-        )
-    check_writable(out)
-    # Beside the netCDF, on the same disk.
-    unfinished = out.with_name(f"{out.name}.unfinished")
-    if unfinished.exists() and not resume:
-        raise OutputError(
-            f"{unfinished}: expected no unfinished run of {out.name}, found one; add --resume to continue it, or "
-            "delete the folder to start anew"
-        )
+    unfinished = _unfinished(out, resume)
     trained = load_model(model)
     settings = _settings(trained.config, overrides or [], method)
+    _check_method(settings, unfinished)
+    log = read_log(logs, trained.config.log, require_force=given is Forces.log)
     if figures is not None:
         prepare_folder(figures)
-    log = read_log(logs, trained.config.log, require_force=given is Forces.log)
+        check_writable(figures / "force.png")
     if resume and not unfinished.exists():
         console.print("nothing to resume: sampling from the start")
-    with terminal.sampling_progress(console) as hook:
-        posterior = trained.sample(log, given.value, settings, hook, unfinished)
+    try:
+        with terminal.sampling_progress(console) as hook:
+            posterior = trained.sample(log, given.value, settings, hook, unfinished)
+    except KeyboardInterrupt:
+        if unfinished.exists():
+            console.print("sampling was stopped: to continue, add --resume to the same command")
+        raise
     save_netcdf(posterior, out)
     Checkpoint(unfinished, {}).remove()
     console.print(str(posterior.engine), highlight=False, soft_wrap=True)
@@ -107,6 +103,31 @@ def sample_command(
     if figures is not None:
         for path in save_draw_figures(posterior, figures):
             console.print(f"wrote {path}", highlight=False, soft_wrap=True)
+
+
+def _unfinished(out: Path, resume: bool) -> Path:
+    """Where chains are kept until `out` is written: beside it, on the same disk."""
+    if out.suffix != SUFFIX:
+        raise OutputError(
+            f"{out}: expected a file name that ends in {SUFFIX} (netCDF), got {out.suffix!r}; name one"
+        )
+    check_file(out)
+    unfinished = out.with_name(f"{out.name}.unfinished")
+    if unfinished.exists() and not resume:
+        raise OutputError(
+            f"{unfinished}: expected no unfinished run of {out.name}, found one; add --resume to continue it, or "
+            "delete the folder to start anew"
+        )
+    return unfinished
+
+
+def _check_method(settings: SamplingConfig, unfinished: Path) -> None:
+    """Only chains go on; what another method draws takes their place."""
+    if settings.method != "nuts" and unfinished.exists():
+        raise OutputError(
+            f"{unfinished}: expected no unfinished chains where {settings.method} is to draw, found some; leave out "
+            "--method and --set sampling.method to continue them, write to another --out, or delete the folder"
+        )
 
 
 def _settings(config: Config, overrides: list[str], method: Method | None) -> SamplingConfig:

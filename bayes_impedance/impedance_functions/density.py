@@ -39,7 +39,8 @@ class Designs:
     def matrices(self, weights: tuple[Tensor, ...]) -> Tensor:
         """K, D, M, `(groups, n, 3, axes, axes)`."""
         parts = zip(self.functions, self.designs, weights, strict=True)
-        return torch.stack([function.matrices(design, own) for function, design, own in parts], dim=2)
+        logarithms = [function.logarithm(design, own) for function, design, own in parts]
+        return self.functions[0].exponential(torch.stack(logarithms, dim=2))
 
 
 def beside_impedance(model: ForceModel) -> list[Entry]:

@@ -97,7 +97,7 @@ class ImpedanceFunction:
 
     def logarithm(self, design: Tensor, weights: Tensor) -> Tensor:
         """Entries of S, `(groups, n, entries)`, for `weights` `(groups, entries, width)`."""
-        return self.location + torch.einsum("genw,gew->gne", design, weights)
+        return self.location + (design @ weights.unsqueeze(-1))[..., 0].mT
 
     def matrices(self, design: Tensor, weights: Tensor) -> Tensor:
         """exp S, `(groups, n, axes, axes)`."""

@@ -138,10 +138,11 @@ def plot_confounding(posterior: DrawnPosterior) -> Figure:
     """
     axes = posterior.axes
     figure, grid = panel_grid(1, len(axes), sharex="all", sharey="all", width=4.6)
-    step = -(-np.prod(posterior.draws.shape) // POINTS)
+    step = int(-(-np.prod(posterior.draws.shape) // POINTS))
     parameter = next(p for p in posterior.parameters if p.name == "desired_trajectory_sd")
     sd = posterior.values()[parameter.name].reshape(-1, *parameter.shape)[::step, :, 0]
-    matrices = posterior.latents[Latent.STIFFNESS]
+    matrices = posterior.matrices(Latent.STIFFNESS)
+    matrices = matrices.reshape(np.prod(posterior.draws.shape), -1, len(axes), len(axes))[::step]
     generator = np.random.default_rng(0)
     prior = posterior.prior_impedance(PRIOR_DRAWS)[Latent.STIFFNESS]
     assert parameter.median is not None
@@ -151,12 +152,13 @@ def plot_confounding(posterior: DrawnPosterior) -> Figure:
     )
     for a, one in zip(range(len(axes)), posterior.verdicts, strict=False):
         ax = grid[0][a]
-        average = np.exp(np.log(matrices[::step, :, :, a, a]).mean(axis=(1, 2)))
+        average = np.exp(np.log(matrices[..., a, a]).mean(axis=1))
         ax.plot(before, np.exp(np.log(prior[..., a, a]).mean(axis=1)), ".", ms=3, color=PRIOR, label="prior")
         ax.plot(sd[:, a], average, ".", ms=3, color=POSTERIOR, label="posterior")
         ax.set_xscale("log")
         logarithmic(ax)
-        ax.set_title(f"{axes[a]}: correlation of logarithms {one.correlation:.2f}", fontsize=8)
+        known = "" if np.isnan(one.correlation) else f": correlation of logarithms {one.correlation:.2f}"
+        ax.set_title(f"{axes[a]}{known}", fontsize=8)
         label_panel(ax, a, 0, 1, "stiffness, path average [N/m]", "SD of the desired trajectory [m]")
     return finished(figure, grid, "What stiffness goes with")
 

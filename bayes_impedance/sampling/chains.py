@@ -67,10 +67,7 @@ def sample_nuts(
         OutputError: a checkpoint is damaged, or of another model, other data or other settings.
     """
     if checkpoint is not None:
-        checkpoint = replace(checkpoint, fingerprint={**checkpoint.fingerprint, **fingerprint(settings)})
-        for number in range(settings.chains):
-            # Sooner than in a process of its own, whose refusal would be a chain lost.
-            checkpoint.read(number)
+        checkpoint = checked(checkpoint, settings)
     task = Task(density, start, settings, checkpoint)
     workers = min(settings.chains, processes or _cores())
     report = progress or _say_nothing
@@ -84,6 +81,18 @@ def sample_nuts(
     chains = [drawn for _, drawn in sorted(fates.drawn.items())]
     stats = {name: np.stack([own[name] for _, own in chains]) for name in chains[0][1]}
     return Draws("nuts", np.stack([standard for standard, _ in chains]), stats, lost=lost)
+
+
+def checked(checkpoint: Checkpoint, settings: SamplingConfig) -> Checkpoint:
+    """With the settings among what it is of; sooner than in a process of a chain, whose refusal would be a chain lost.
+
+    Raises:
+        OutputError: a checkpoint is damaged, or of another model, other data or other settings.
+    """
+    named = replace(checkpoint, fingerprint={**checkpoint.fingerprint, **fingerprint(settings)})
+    for number in range(settings.chains):
+        named.read(number)
+    return named
 
 
 def _one_by_one(task: Task, progress: Progress) -> Fates:

@@ -21,7 +21,7 @@ from bayes_impedance.sampling.parameters import QUANTITIES, Parameter
 Array = NDArray[np.float64]
 
 #: Units of what a sampler says of its draws; the rest are numbers.
-STAT_UNITS = {"lp": "nats", "energy": "nats", "diverging": "1 where a trajectory diverged"}
+STAT_UNITS = {"lp": "nats", "energy": "nats"}
 
 
 def as_tree(posterior: DrawnPosterior) -> xarray.DataTree:
@@ -49,8 +49,11 @@ def as_tree(posterior: DrawnPosterior) -> xarray.DataTree:
         "diagnosis": json.dumps(posterior.diagnosis.as_dict()),
         "findings": "\n".join(posterior.diagnosis.findings),
     }
-    for data in groups.values():
-        data.attrs |= {"inference_library": "pyro", "method": posterior.draws.method}
+    chains, draws = posterior.draws.shape
+    for name, data in groups.items():
+        if "chain" in data.dims:
+            groups[name] = data.assign_coords(chain=np.arange(chains), draw=np.arange(draws))
+        groups[name].attrs |= {"inference_library": "pyro", "method": posterior.draws.method}
     return xarray.DataTree.from_dict({"/": xarray.Dataset(attrs=attributes), **groups})
 
 
@@ -61,7 +64,8 @@ def save_netcdf(posterior: DrawnPosterior, path: Path) -> None:
         OutputError: the file cannot be written.
     """
     with whole_file(path) as temporary:
-        as_tree(posterior).to_netcdf(temporary, engine="h5netcdf")
+        # By way of memory: on a full disk HDF5 crashes.
+        temporary.write_bytes(as_tree(posterior).to_netcdf(engine="h5netcdf"))
 
 
 def _posterior(posterior: DrawnPosterior) -> xarray.Dataset:

@@ -74,12 +74,12 @@ class SampledDensity(TiltedDensity):
         coordinates = torch.from_numpy(point).clone().requires_grad_()
         value = self.log_density(coordinates)
         (gradient,) = torch.autograd.grad(value, coordinates)
-        if not (bool(value.isfinite()) and bool(gradient.isfinite().all())):
+        if not (np.isfinite(value.item()) and np.isfinite(gradient.numpy()).all()):
             raise NotPositiveDefiniteError(
                 "expected a finite posterior density, found one that overflows, or its gradient does; check log.units, "
                 "and that the medians under model are of the size that their unit lets expect"
             )
-        return float(value.detach()), gradient.numpy()
+        return value.item(), gradient.numpy()
 
 
 class JointDensity(SampledDensity):
@@ -111,14 +111,19 @@ class JointDensity(SampledDensity):
         )
         self._entries = {entry.name: entry for entry in model.entries}
         # Components that nothing learns stay where the hyperprior has its median.
-        self._learned: tuple[Entry, ...] = tuple(hyperparameters_of(model, self._functions))
+        learned: list[Entry] = hyperparameters_of(model, self._functions)
+        self._varying = {entry.name.split(".")[0] for entry in learned}.intersection(QUANTITIES)
         self.parameters: tuple[Parameter, ...] = (
             *weights_of(self._functions, len(features.groups)),
-            *(parameter_of(entry, self.coupled) for entry in self._learned),
+            *(parameter_of(entry, self.coupled) for entry in learned),
         )
         sizes = [parameter.size for parameter in self.parameters]
         super().__init__(sum(sizes[: len(QUANTITIES)]), np.ones(sum(sizes), dtype=bool))
         self.sizes = sizes
+        # exp of all hyperparameters at once.
+        hyperparameters = self.parameters[len(QUANTITIES) :]
+        self._medians = _joined([p.median.expand(p.shape) for p in hyperparameters if p.median is not None])
+        self._log_sds = _joined([p.log_sd.expand(p.shape) for p in hyperparameters if p.log_sd is not None])
         medians = {p.name: p.median.expand(p.shape) for p in self.parameters if p.median is not None}
         with torch.no_grad():
             processes = self.processes(medians)
@@ -133,8 +138,10 @@ class JointDensity(SampledDensity):
 
     def values(self, standard: Tensor) -> dict[str, Tensor]:
         """Values of all sites at coordinates `(..., size)`, by name."""
-        parts = standard.split(self.sizes, dim=-1)
-        return {p.name: p.value(part) for p, part in zip(self.parameters, parts, strict=True)}
+        own, raw = standard.split([self.weight_count, self.size - self.weight_count], dim=-1)
+        values = torch.cat([own, self._medians * torch.exp(self._log_sds * raw)], dim=-1)
+        parts = zip(self.parameters, values.split(self.sizes, dim=-1), strict=True)
+        return {p.name: part.reshape(*part.shape[:-1], *p.shape) for p, part in parts}
 
     def standard(self, values: Mapping[str, Tensor]) -> Tensor:
         """The inverse of `values`."""
@@ -188,7 +195,7 @@ class JointDensity(SampledDensity):
             value = self.engine.log_likelihood_given_impedance(self.processes(values), impedance).sum()
         except ConfigurationError as error:
             # The processes were accepted at the medians: only the number of features can have grown.
-            raise NotPositiveDefiniteError(str(error)) from error
+            raise NotPositiveDefiniteError(f"length scales became shorter than an engine holds: {error}") from error
         loop = self.features.loop
         if loop is None:
             return value
@@ -208,7 +215,7 @@ class JointDensity(SampledDensity):
 
     def varies(self, quantity: str) -> bool:
         """Whether how a function varies is sampled, too."""
-        return any(entry.name.startswith(f"{quantity}.") for entry in self._learned)
+        return quantity in self._varying
 
     def _covariance(
         self, name: str, kernel: Stationary, values: Mapping[str, Tensor], scale: str = "sd"
@@ -222,6 +229,11 @@ class JointDensity(SampledDensity):
             if (entry := self._entries.get(f"{name}.{key}")) is not None
         }
         return StationaryCovariance.like(kernel, parts[scale], parts.get("length_scale"), parts.get("shape"))
+
+
+def _joined(parts: list[Tensor]) -> Tensor:
+    """All entries of some tensors in one row."""
+    return torch.cat([torch.zeros(0, dtype=torch.float64), *(part.reshape(-1) for part in parts)])
 
 
 def _plain(kernel: Stationary) -> StationaryCovariance:

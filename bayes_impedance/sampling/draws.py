@@ -20,8 +20,8 @@ Progress = Callable[[int, int, int, str], None]
 class Draws:
     """Coordinates `standard` `(chains, draws, size)` of a `JointDensity`.
 
-    `stats`: by name, `(chains, draws)` each: for nuts `lp`, `diverging`, `n_steps`, `acceptance_rate`, `step_size`,
-    `energy`; for approximations `lp`. `pareto_k` is the shape of the tail of their importance ratios, None for nuts;
+    `stats`: by name, `(chains, draws)` each: for nuts those of a `Chain`, for approximations the log density "lp" alone.
+    `pareto_k` is the shape of the tail of their importance ratios, None for nuts;
     `lost` says of each chain that died with what; `remarks` are what else a reader should know of how they were drawn.
     """
 

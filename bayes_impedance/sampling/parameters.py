@@ -95,12 +95,8 @@ def parameter_of(entry: Entry, tied: bool) -> Parameter:
 def filled(entry: Entry, values: Mapping[str, Tensor]) -> Tensor:
     """A hyperparameter with its fixed components, `(axes, 1, 1, components)`, from values of sites."""
     axes, components = entry.raw.shape[0], len(entry.specs)
-    medians = entry.medians.expand(axes, components)
-    learned = values.get(entry.name.replace(".", "_"))
-    if learned is None:
-        return medians.reshape(axes, 1, 1, components)
-    if learned.shape[-1] == components:
-        whole = learned.expand(axes, components)
-    else:
-        whole = medians.index_copy(1, entry.free.nonzero()[:, 0], learned.expand(axes, learned.shape[-1]))
-    return whole.reshape(axes, 1, 1, components)
+    whole = values.get(entry.name.replace(".", "_"), entry.medians)
+    if whole.shape[-1] < components:
+        learned = whole.expand(axes, whole.shape[-1])
+        whole = entry.medians.expand(axes, components).index_copy(1, entry.free.nonzero()[:, 0], learned)
+    return whole.expand(axes, components).reshape(axes, 1, 1, components)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayes_impedance.config import Config
+from bayes_impedance.features import FeatureMap
 from bayes_impedance.preprocessing import PreparedLog, PreparedTrial
 from bayes_impedance.preprocessing.prepared import ARRAYS
 
@@ -20,6 +21,8 @@ Integers = NDArray[np.int64]
 MOST_SAMPLES = 1000
 #: Name of a motion that nobody made, so that it has a residual force of its own.
 AVERAGE = "average motion"
+#: A repetition that covers less of the phase than this share of the longest of its group was broken off.
+COMPLETE = 0.9
 
 
 @dataclass(frozen=True)
@@ -38,12 +41,20 @@ class Places:
 
 
 def choose_places(config: Config, log: PreparedLog, places: int) -> Places:
-    """Average motions over phase, where the desired trajectory is a function of it, else `places` samples a trial."""
+    """Average motions over phase, where the desired trajectory is one function of it for all repetitions of a group.
+
+    Else, and where groups have no phase in common, `places` samples of each trial.
+    """
     step = -(-log.n_samples // MOST_SAMPLES)
     forces = tuple(np.arange(0, trial.n_samples, step) for trial in log.trials)
     none = np.zeros(0, dtype=np.int64)
-    if config.model.trajectory_input == "phase":
-        averages = tuple(average_motion(log, group, places) for group in log.groups)
+    if config.model.trajectory_input == "phase" and FeatureMap(config, log.axes).trajectory_shared:
+        low, high = common_phase(log)
+    else:
+        low, high = 0.0, 0.0
+    if low < high:
+        phase = np.linspace(low, high, places)
+        averages = tuple(average_motion(log, group, phase) for group in log.groups)
         every = (np.arange(places),) * len(averages)
         return Places(
             PreparedLog(log.axes, averages + log.trials),
@@ -57,27 +68,36 @@ def choose_places(config: Config, log: PreparedLog, places: int) -> Places:
     return Places(log, samples, kept, forces, "time" if len(log.trials) == 1 else "place")
 
 
-def average_motion(log: PreparedLog, group: str, places: int) -> PreparedTrial:
-    """Mean over the repetitions of a group at equal phase, at `places` values of the phase that all groups reach."""
-    parts = [part for name in log.groups for part in _repetitions(log, name)]
-    low = max(float(_phase(part).min()) for part in parts)
-    high = min(float(_phase(part).max()) for part in parts)
-    phase = np.linspace(low, high, places)
-    own = [part for part in parts if part.group == group]
+def common_phase(log: PreparedLog) -> tuple[float, float]:
+    """From where to where all repetitions of all groups go, but for those that were broken off."""
+    parts = [part for group in log.groups for part in _repetitions(log, group)]
+    return max(float(_phase(part).min()) for part in parts), min(float(_phase(part).max()) for part in parts)
+
+
+def average_motion(log: PreparedLog, group: str, phase: Array) -> PreparedTrial:
+    """Mean over the repetitions of a group at equal phase, but for those that were broken off."""
+    own = _repetitions(log, group)
     values = {
         name: np.mean([_at_phase(part, name, phase) for part in own], axis=0)
         for name in ARRAYS
         if name not in ("force", "perturbation", "smoothing", "repetition")
         and all(getattr(part, name) is not None for part in own)
     }
-    repetition = np.zeros(places, dtype=np.int64)
+    repetition = np.zeros(len(phase), dtype=np.int64)
     # Of the group's own name, for names of trials differ.
     named = {"name": f"{AVERAGE} of {group}", "group": group, "source": "memory"}
     arrays: dict[str, Any] = {**named, **values, "phase": phase, "repetition": repetition}
     return PreparedTrial(**arrays)
 
 
-def _repetitions(log: PreparedLog, group: str) -> Iterator[PreparedTrial]:
+def _repetitions(log: PreparedLog, group: str) -> list[PreparedTrial]:
+    """Repetitions of a group, those that were broken off left out."""
+    parts = list(_every_repetition(log, group))
+    covered = [float(np.ptp(_phase(part))) for part in parts]
+    return [part for part, span in zip(parts, covered, strict=True) if span >= COMPLETE * max(covered)]
+
+
+def _every_repetition(log: PreparedLog, group: str) -> Iterator[PreparedTrial]:
     for trial in log.trials:
         if trial.group == group:
             for number in np.unique(trial.repetition):
@@ -94,7 +114,10 @@ def _phase(trial: PreparedTrial) -> Array:
 
 def _at_phase(trial: PreparedTrial, name: str, phase: Array) -> Array:
     values = np.asarray(getattr(trial, name))
-    columns = [np.interp(phase, _phase(trial), column) for column in values.reshape(len(values), -1).T]
+    # Noise lets phase go back for a sample or two.
+    order = np.argsort(_phase(trial), kind="stable")
+    known, columns = _phase(trial)[order], values[order].reshape(len(values), -1).T
+    columns = [np.interp(phase, known, column) for column in columns]
     return np.stack(columns, axis=-1).reshape(len(phase), *values.shape[1:])
 
 

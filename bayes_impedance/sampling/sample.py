@@ -22,7 +22,7 @@ from bayes_impedance.impedance_functions.threads import one_thread
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER
 from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.priors import build_force_model
-from bayes_impedance.sampling.chains import sample_nuts
+from bayes_impedance.sampling.chains import checked, sample_nuts
 from bayes_impedance.sampling.checkpoint import Checkpoint
 from bayes_impedance.sampling.dataset import names_of_coordinates
 from bayes_impedance.sampling.density import JointDensity
@@ -118,6 +118,9 @@ def draw(
         SamplingError: every chain died.
         OutputError: the checkpoint is of another posterior, or cannot be written.
     """
+    if checkpoint is not None and settings.method == "nuts":
+        # Before the climb, which may take minutes.
+        checked(checkpoint, settings)
     transported = TransportedDensity(density)
     start = find_start(transported, training, progress=_climbing(hook))
     if settings.method == "svi":
@@ -135,6 +138,9 @@ def _fingerprint(problem: Problem, inducing: tuple[Tensor | None, ...]) -> dict[
     digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
     for inputs in inducing:
         digest.update(b"" if inputs is None else inputs.numpy().tobytes())
+    # A model that was trained on another log has another prior mean of x_d.
+    for trial in problem.evidence.trials:
+        digest.update(problem.mean.derivatives(trial).tobytes())
     return {
         "model": digest.hexdigest()[:16],
         "recordings": problem.evidence.fingerprint()[:16],

@@ -28,15 +28,17 @@ CONFOUNDED = 0.8
 #: Sensitivity to the power of a prior from which on it is worth a look (Kallioinen et al., *Detecting and diagnosing
 #: prior and likelihood sensitivity with power-scaling*, Statistics and Computing 2024).
 SENSITIVE = 0.05
-#: Powers of a prior between which a posterior is compared, and draws that this takes.
+#: Powers of a prior between which a posterior is compared.
 POWERS = (0.8, 1.25)
+#: The fewest draws that say anything of a variance, and of what a prior does.
 FEWEST = 100
+TOO_FEW = "{} draws are too few to tell what the data said, set sampling.draws higher"
 
 
 @dataclass(frozen=True)
 class ExactVerdict:
-    """A `Verdict` from draws, with the correlation of log w with the logarithm of the SD of x_d, NaN where that is
-    fixed, and with how much the posterior moves with the power of the prior of its level.
+    """A `Verdict` from draws, with the correlation of log w with the logarithm of the SD of x_d, and how much the
+    posterior moves with the power of the prior of its level. NaN where either is fixed, or the draws are too few.
     """  # fmt: skip
 
     verdict: Verdict
@@ -64,9 +66,12 @@ def exact_verdicts(
     """Verdicts on stiffness, damping and mass of each axis, averaged over places.
 
     As the verdicts on Gaussian posteriors (docs/model.md §6); besides, nothing is claimed of what goes with the SD of
-    the desired trajectory.
+    the desired trajectory, nor from fewer than 100 draws.
     """
     confounded = confounding(config, repetitions, perturbed)
+    count = len(evidence.impedance[Latent.STIFFNESS])
+    if count < FEWEST:
+        confounded = TOO_FEW.format(count)
     return [
         _verdict(evidence, latent, a, axis, confounded)
         for latent in IMPEDANCE_ORDER
@@ -82,9 +87,11 @@ def _verdict(evidence: Evidence, latent: Latent, a: int, axis: str, confounded: 
     contraction = 0.0 if is_fixed else float(1.0 - log_draws.var(axis=0).mean() / before)
     average = log_draws.mean(axis=1)
     correlation = float("nan")
-    if evidence.trajectory_sd is not None and not is_fixed:
-        correlation = float(np.corrcoef(average, np.log(evidence.trajectory_sd[:, a]))[0, 1])
-    sensitivity = 0.0 if is_fixed else _sensitivity(average, evidence.log_prior[latent][:, a])
+    sensitivity = float("nan")
+    if len(draws) >= FEWEST and not is_fixed:
+        sensitivity = _sensitivity(average, evidence.log_prior[latent][:, a])
+        if evidence.trajectory_sd is not None:
+            correlation = _correlation(average, np.log(evidence.trajectory_sd[:, a]))
     if confounded is None and abs(correlation) >= CONFOUNDED:
         confounded = (
             f"it goes with the SD of the desired trajectory (correlation {correlation:.2f}), and only their product is "
@@ -93,6 +100,8 @@ def _verdict(evidence: Evidence, latent: Latent, a: int, axis: str, confounded: 
     support = classify(contraction) if confounded is None else Support.PRIOR_ONLY
     bands = _bands(draws, prior)
     sentence = verdict_sentence(latent, axis, contraction, support, confounded, is_fixed)
+    if len(draws) < FEWEST and not is_fixed:
+        sentence = f"{latent.value} {axis}{axis}: {support.value}; {confounded}."
     if sensitivity > SENSITIVE and support is not Support.PRIOR_ONLY:
         sentence += (
             f" It moves with its prior (sensitivity {rounded(sensitivity)}): look at another prior, too."
@@ -108,7 +117,8 @@ def exact_off_diagonals(evidence: Evidence, axes: Sequence[str]) -> list[OffDiag
         for a in range(len(axes)):
             for b in range(a + 1, len(axes)):
                 draws, prior = (part[latent][..., a, b] for part in (evidence.impedance, evidence.prior))
-                contraction = float(1.0 - draws.var(axis=0).mean() / prior.var(axis=0).mean())
+                before = prior.var(axis=0).mean()
+                contraction = float(1.0 - draws.var(axis=0).mean() / before) if before > 0.0 else 0.0
                 mean = float(draws.mean())
                 listed.append(
                     OffDiagonal(latent, axes[a] + axes[b], mean, *_bands(draws, prior), contraction)
@@ -124,10 +134,17 @@ def _bands(draws: Array, prior: Array) -> tuple[float, float, float, float]:
     return low, high, prior_low, prior_high
 
 
+def _correlation(values: Array, others: Array) -> float:
+    """NaN where one of them never moved."""
+    if np.ptp(values) == 0.0 or np.ptp(others) == 0.0:
+        return float("nan")
+    return float(np.corrcoef(values, others)[0, 1])
+
+
 def _sensitivity(values: Array, log_prior: Array) -> float:
     """How much the distribution of `values` `(draws,)` moves with the power of a prior, per doubling of it."""
-    if np.ptp(log_prior) == 0.0 or len(values) < FEWEST:
-        return 0.0
+    if np.ptp(log_prior) == 0.0 or np.ptp(values) == 0.0:
+        return float("nan")
     lower, upper = (np.exp(array_stats.power_scale_lw(log_prior, alpha=power)) for power in POWERS)
     parts = [part[None] for part in (values, lower / lower.sum(), upper / upper.sum())]
     return float(array_stats.power_scale_sense(*parts, *POWERS))

@@ -32,9 +32,10 @@ class TransportedDensity(SampledDensity):
         self.density = density
         count = density.weight_count
         self._curvature = torch.zeros(count, count, dtype=torch.float64)
-        self._centre = torch.zeros(count, dtype=torch.float64)
+        self._target = torch.zeros(count, dtype=torch.float64)
         self._reference: dict[int, Tensor] = {}
         self._varies = any(density.varies(name) for name in QUANTITIES)
+        self._at_reference = self._solved(self._curvature, self._target)
 
     def settle(self, point: Array, precision: Array) -> tuple[Array, float]:
         """Take the curvature about a mode for the likelihood's; the same place in the new coordinates.
@@ -49,8 +50,9 @@ class TransportedDensity(SampledDensity):
             whole = root @ torch.from_numpy(precision[:count, :count]) @ root.mT
             values, vectors = torch.linalg.eigh(whole - torch.eye(count, dtype=torch.float64))
             self._curvature = (vectors * values.clamp_min(0.0)) @ vectors.mT
-            self._centre = standard[:count].clone()
+            self._target = standard[:count] + self._curvature @ standard[:count]
             self._reference = self._roots(coordinates)
+            self._at_reference = self._solved(self._curvature, self._target)
         return np.concatenate([np.zeros(count), point[count:]]), 0.0
 
     def standard(self, coordinates: Tensor) -> tuple[Tensor, Tensor]:
@@ -79,14 +81,15 @@ class TransportedDensity(SampledDensity):
 
     def _posterior(self, coordinates: Tensor) -> tuple[Tensor, Tensor]:
         """Cholesky factor of A, and the mean of v."""
-        eye = torch.eye(self.weight_count, dtype=torch.float64)
-        target = self._curvature @ self._centre + self._centre
         if not (self._varies and self._reference):
-            root = torch.linalg.cholesky(eye + self._curvature)
-            return root, torch.cholesky_solve(target.unsqueeze(-1), root)[:, 0]
+            return self._at_reference
         change = self._change(coordinates)
-        root = torch.linalg.cholesky(eye + change.mT @ self._curvature @ change)
-        return root, torch.cholesky_solve((change.mT @ target).unsqueeze(-1), root)[:, 0]
+        return self._solved(change.mT @ self._curvature @ change, change.mT @ self._target)
+
+    def _solved(self, curvature: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        """Cholesky factor of I + `curvature`, and A⁻¹ `target`."""
+        root = torch.linalg.cholesky(torch.eye(self.weight_count, dtype=torch.float64) + curvature)
+        return root, torch.cholesky_solve(target.unsqueeze(-1), root)[:, 0]
 
     def _change(self, coordinates: Tensor) -> Tensor:
         """Q, block diagonal over groups and entries of K, D and M."""
