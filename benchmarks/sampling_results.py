@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from bayes_impedance import ImpedanceModel, Latent, load_config, read_log
 from bayes_impedance.config import Config, SamplingConfig
 from bayes_impedance.preprocessing import PreparedLog
+from bayes_impedance.sampling.density import weights
 from bayes_impedance.sampling.drawn import DrawnPosterior
 from bayes_impedance.simulation.generative import draw_force, repeated_motion
 from benchmarks.coupled_results import (
@@ -53,6 +54,9 @@ ROBOT = {"warmup": 150, "draws": 250, "target_acceptance": 0.95}
 AGAIN = {"chains": 2, "warmup": 30, "draws": 50}
 #: Draws that functions are compared at, at every sample of a log.
 COMPARED = 300
+#: Functions as they are sampled, and with the variation that their inducing inputs do not carry, which the bands of
+#: a mode have, too.
+WAYS = ("nuts", "nuts_whole")
 ROBOT_NAME = "iiwa_known_equilibrium"
 #: Kernels that have a state-space form, so that a gradient costs a tenth.
 MARKOV = (
@@ -162,28 +166,47 @@ def arm(seed: int, warmup: int, draws: int) -> Results:
     drawn = model.sample(log, settings=SamplingConfig(seed=seed, warmup=warmup, draws=draws))
     standard = drawn.draws.standard.reshape(-1, drawn.density.size)
     chosen = np.unique(np.linspace(0, len(standard) - 1, COMPARED).astype(int))
-    after = along_path(drawn, standard[chosen])
-    before = along_path(drawn, np.random.default_rng(seed).standard_normal((COMPARED, drawn.density.size)))
+    after = {way: along_path(drawn, standard[chosen], way == "nuts_whole") for way in WAYS}
+    standard = np.random.default_rng(seed).standard_normal((COMPARED, drawn.density.size))
+    before = {way: along_path(drawn, standard, way == "nuts_whole") for way in WAYS}
     figures: Results = {"diagnosis": trustworthiness(drawn), "verdict": verdict(drawn, Latent.STIFFNESS)}
     for name, a, b in (("xx", 0, 0), ("yy", 1, 1), ("xy", 0, 1)):
         for j, quantity in enumerate(QUANTITIES):
             true = truth(log, quantity, name)
             columns = {entry: (marginal, column) for entry, marginal, column in entries(mode, quantity)}
             figures[f"{quantity.value}_{name}"] = {
-                "nuts": interval_figures(after[:, :, j, a, b], before[:, :, j, a, b], true),
-                "mode": entry_figures(*columns[name], true),
-            }
-    for way in ("nuts", "mode"):
-        shares = [figures[f"stiffness_{name}"][way]["coverage"] for name in ("xx", "yy", "xy")]
-        figures[f"stiffness_coverage_{way}"] = float(np.mean(shares))
+                way: interval_figures(after[way][:, :, j, a, b], before[way][:, :, j, a, b], true)
+                for way in WAYS
+            } | {"mode": entry_figures(*columns[name], true)}
+    figures["stiffness_coverage"] = {
+        way: float(np.mean([figures[f"stiffness_{name}"][way]["coverage"] for name in ("xx", "yy", "xy")]))
+        for way in (*WAYS, "mode")
+    }
     return figures
 
 
-def along_path(drawn: DrawnPosterior, standard: Array) -> Array:
-    """K, D and M at the samples of the log, in its order, for each of the coordinates: `(draws, n, 3, axes, axes)`."""
+def along_path(drawn: DrawnPosterior, standard: Array, whole: bool) -> Array:
+    """K, D and M at the samples of the log, in its order, for each of the coordinates: `(draws, n, 3, axes, axes)`.
+
+    `whole` adds to the matrix logarithm what inducing inputs do not carry, of its prior variance at each sample.
+    """
     density = drawn.density
+    inputs = density.features.inputs
+    generator = torch.Generator().manual_seed(0)
+    found = []
     with torch.no_grad():
-        found = [density.impedance(density.values(torch.from_numpy(row)))[0].numpy() for row in standard]
+        for row in standard:
+            values = density.values(torch.from_numpy(row))
+            matrices = []
+            for function, own in zip(density.functions(values), weights(values), strict=True):
+                design = function.design(inputs)
+                logarithm = function.logarithm(design, own)
+                if whole:
+                    left_out = function.left_out(inputs, design).transpose(1, 2).sqrt()
+                    noise = torch.randn(left_out.shape, generator=generator, dtype=torch.float64)
+                    logarithm = logarithm + left_out * noise
+                matrices.append(function.exponential(logarithm)[0].numpy())
+            found.append(np.stack(matrices, axis=1))
     rows = density.features.rows[0]
     order = np.lexsort((rows[:, 1], rows[:, 0]))
     return np.stack(found)[:, order]
