@@ -273,8 +273,12 @@ def short_run(seed: int) -> Results:
 
 def main() -> None:
     """Compute everything and write the committed JSON."""
+    recovered = []
+    for seed in SEEDS:
+        recovered.append(recovery(seed))
+        print("recovery", seed, rounded(recovered[-1]), flush=True)
     figures: Results = {
-        "recovery": over_seeds([recovery(seed) for seed in SEEDS]),
+        "recovery": over_seeds(recovered),
         "arm": arm(0, **ARM),
         "unperturbed": unperturbed(0, **UNPERTURBED),
         "again": {"first": short_run(0), "second": short_run(0), "other_seed": short_run(1)},
