@@ -45,10 +45,10 @@ bench: $(INSTALLED)
 	for file in benchmarks/test_*.py; do \
 		$(BIN)/python -m pytest $$file --benchmark-disable-gc -q -p no:cacheprovider -n 0 || exit 1; done
 
-# The figures quoted in the README and the notebooks; writes results/*.json. An hour on two cores; on one
+# The figures quoted in the README and the notebooks; writes results/*.json. Over an hour on two cores; on one
 # thread each, so that rounding is the same everywhere.
 results: $(INSTALLED)
-	for part in core recordings reading closed_loop simulated_arm planning coupled calibration; do \
+	for part in core recordings reading closed_loop simulated_arm planning coupled calibration sampling; do \
 		OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.$${part}_results || exit 1; done
 
 # The API reference, from the docstrings, in docs/api/.

@@ -23,7 +23,9 @@ def committed(name: str) -> Results:
 
 def commit(name: str, seed: int, figures: Results) -> None:
     """Write `figures` to `results/<name>.json`, with command, seed and versions."""
-    versions = {package: version(package) for package in ("bayes-impedance", "torch", "gpytorch", "numpy")}
+    versions = {
+        package: version(package) for package in ("bayes-impedance", "torch", "gpytorch", "pyro-ppl", "numpy")
+    }
     record = {"command": "make results", "seed": seed, "versions": versions, "figures": figures}
     path = ROOT / "results" / f"{name}.json"
     path.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")

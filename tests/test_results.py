@@ -14,6 +14,8 @@ from benchmarks.coupled_results import identified
 from benchmarks.planning_results import ARMS, CHECKED_PERTURBATIONS, PERTURBATIONS, planned, widths
 from benchmarks.reading_results import BAGS, RECORDINGS, bag
 from benchmarks.recordings_results import last_third
+from benchmarks.sampling_results import SEEDS as SAMPLED_SEEDS
+from benchmarks.sampling_results import short_run
 from benchmarks.simulated_arm_results import DAMPING, INTENTIONS, SESSIONS, STIFFNESS, Competition, table_i
 
 RESULTS = Path(__file__).resolve().parent.parent / "results"
@@ -178,6 +180,37 @@ def test_ignoring_coupling_costs() -> None:
             rivals = [scores for name, scores in seed[axis].items() if name != "arm"]
             assert all(seed[axis]["arm"]["msll"] < scores["msll"] - 1.0 for scores in rivals)
             assert all(seed[axis]["arm"]["smse"] < 0.3 * scores["smse"] for scores in rivals)
+
+
+def test_sampling() -> None:
+    """Two short chains again, and what draws owe: recovery, chains that agree, claims where there is something to."""
+    figures = committed("sampling")["figures"]
+    again = figures["again"]
+    assert again["first"] == again["second"]
+    assert again["first"]["digest"] != again["other_seed"]["digest"]
+    # Other machines round otherwise, and then draws differ, not what they are drawn from.
+    assert short_run(0)["stiffness"] == pytest.approx(again["first"]["stiffness"], rel=5e-3)
+    recovery = figures["recovery"]
+    assert len(recovery["rhat_max"]) == len(SAMPLED_SEEDS)
+    assert recovery["stiffness"]["error_median"] <= 0.02
+    assert recovery["damping"]["error_median"] <= 0.05
+    assert recovery["mass"]["error_median"] <= 0.03
+    assert recovery["largest_rhat"] <= 1.01
+    assert recovery["seeds_without_divergences"] >= 18
+    for entry in ("xx", "yy", "xy"):
+        assert figures["arm"][f"stiffness_{entry}"]["nuts"]["relative_width"] <= 0.5
+    for axis in figures["unperturbed"]["verdict"].values():
+        assert axis["support"] == "prior only"
+
+
+def test_sampling_the_known_equilibrium() -> None:
+    """The slope of a line lies within narrow intervals; without the reference nothing is claimed."""
+    figures = committed("sampling")["figures"]["robot"]
+    for way in ("reference", "reference_as_shipped"):
+        low, high = figures[way]["stiffness"]["interval"]
+        assert low < figures[way]["least_squares_stiffness"] < high
+        assert high - low < 20.0
+    assert figures["no_reference"]["stiffness"]["support"] == "prior only"
 
 
 def test_recordings(shared_data: Path) -> None:
