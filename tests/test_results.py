@@ -7,6 +7,9 @@ from typing import Any
 
 import pytest
 
+from bayes_impedance.calibration.draw import Trials
+from benchmarks.calibration_results import DRAWS as CALIBRATED
+from benchmarks.calibration_results import settings as calibration_settings
 from benchmarks.closed_loop_results import SEEDS, WAYS, estimate
 from benchmarks.core_results import configuration_of, coverage_of, demo, known_equilibrium
 from benchmarks.coupled_results import SEEDS as COUPLED_SEEDS
@@ -180,6 +183,22 @@ def test_ignoring_coupling_costs() -> None:
             rivals = [scores for name, scores in seed[axis].items() if name != "arm"]
             assert all(seed[axis]["arm"]["msll"] < scores["msll"] - 1.0 for scores in rivals)
             assert all(seed[axis]["arm"]["smse"] < 0.3 * scores["smse"] for scores in rivals)
+
+
+def test_calibration() -> None:
+    """The posterior of one truth again; ranks of NUTS are uniform."""
+    figures = committed("calibration")["figures"]
+    exact = figures["nuts"]["quantities"]
+    assert figures["nuts"]["draws"] == CALIBRATED["nuts"] == 200
+    for wanted in ("stiffness", "damping", "mass", "noise", "desired position"):
+        assert any(wanted in name for name in exact)
+    for name, entry in exact.items():
+        assert entry["p"] > 0.01 / len(exact), name
+        assert len(entry["ranks"]) == CALIBRATED["nuts"]
+    now = Trials(calibration_settings("laplace"))(0)
+    for name, entry in figures["laplace"]["quantities"].items():
+        # Other machines round otherwise: a rank of 99 may move by a few.
+        assert now.rank[name] == pytest.approx(entry["ranks"][0], abs=6), name
 
 
 def test_sampling() -> None:
