@@ -51,7 +51,6 @@ ARM = {"warmup": 150, "draws": 150}
 UNPERTURBED = {"warmup": 100, "draws": 100}
 #: At .8 one draw in forty diverges.
 ROBOT = {"warmup": 150, "draws": 400, "target_acceptance": 0.95}
-ROBOT_AS_SHIPPED = {"warmup": 100, "draws": 200, "target_acceptance": 0.95}
 AGAIN = {"chains": 2, "warmup": 30, "draws": 50}
 #: Draws that functions are compared at, at every sample of a log.
 COMPARED = 300
@@ -285,7 +284,6 @@ def main() -> None:
     if (RECORDINGS / FILES[ROBOT_NAME]).is_file():
         figures["robot"] = {
             "reference": robot(MARKOV, **ROBOT),
-            "reference_as_shipped": robot((), **ROBOT_AS_SHIPPED),
             "no_reference": robot([*MARKOV, *NO_REFERENCE], **ROBOT),
         }
     elif "robot" in (before := committed("sampling")):
