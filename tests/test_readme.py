@@ -122,6 +122,22 @@ def coupled_figures() -> list[str]:
     ]
 
 
+def sampled_figures() -> list[str]:
+    """Of results/sampling.json and results/calibration.json, as the table has them."""
+    sampling, calibration = figures_of("sampling"), figures_of("calibration")
+    recovery = [sampling["recovery"][name] for name in ("stiffness", "damping", "mass")]
+    low, high = sampling["robot"]["reference"]["stiffness"]["interval"]
+    held = sampling["arm"]["stiffness_coverage"]
+    least = min(entry["p"] for entry in calibration["nuts"]["quantities"].values())
+    return [
+        ", ".join(f"{entry['error_median']:.1%}" for entry in recovery),
+        ", ".join(f"{entry['coverage_mean']:.0%}" for entry in recovery),
+        f"90 % interval {low:.1f}–{high:.1f} N/m; unknown: {sampling['robot']['no_reference']['stiffness']['support']}",
+        f"hold | {held['nuts']:.0%} | {held['mode']:.0%}",
+        f"of uniformity | {least:.2f}",
+    ]
+
+
 def test_quoted_figures_are_those_of_the_results() -> None:
     names = ("core", "closed_loop", "recordings", "simulated_arm")
     core, loop, recordings, arm = (figures_of(name) for name in names)
@@ -177,7 +193,7 @@ def test_quoted_figures_are_those_of_the_results() -> None:
         pairs += [(ours["stiffness_xx"]["mean"], ours["stiffness_yy"]["mean"])]
         pairs += [(found["truth"][0], found["truth"][3])]
         quoted += [f"{xx:.0f}, {yy:.0f}" for xx, yy in pairs]
-    quoted += coupled_figures()
+    quoted += coupled_figures() + sampled_figures()
     plain = table.replace("−", "-").replace(" %", "%")
     for figure in quoted:
         assert figure.replace(" %", "%") in plain, figure
