@@ -62,7 +62,9 @@ def find_mode(
     def vary(point: Array, precision: Array) -> tuple[Array, float]:
         return update_variation(density, point, precision)
 
-    point, precision, climb = take_turns(density, start, max_iterations, gradient_tolerance, progress, vary)
+    point, precision, climb = take_turns(
+        density, start, max_iterations, gradient_tolerance, progress, vary, TURNS, SETTLED
+    )
     return _mode(density, point, precision, climb)
 
 
@@ -72,9 +74,9 @@ def take_turns(
     max_iterations: int,
     gradient_tolerance: float,
     progress: Callable[[int, float], None] | None,
-    vary: Callable[[Array, Array], tuple[Array, float]] | None = None,
-    turns: int = TURNS,
-    settled: float = SETTLED,
+    vary: Callable[[Array, Array], tuple[Array, float]],
+    turns: int,
+    settled: float,
 ) -> tuple[Array, Array, Climb]:
     """Hyperparameters of greatest evidence and the mode of the weights there, with the precision of both.
 
@@ -88,10 +90,9 @@ def take_turns(
     point = climb(start, None, min(FIRST, max_iterations))
     precision = _precision(density, point)
     for _ in range(turns):
-        before, moved = point[density.weight_count :], 0.0
+        before = point[density.weight_count :]
         density.tilt, density.anchor = occam(density, point, precision), None
-        if vary is not None:
-            point, moved = vary(point, precision)
+        point, moved = vary(point, precision)
         density.anchor = point
         point = climb(point, laplace.covariance(precision), max_iterations)
         precision = _precision(density, point)
