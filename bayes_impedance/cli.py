@@ -20,7 +20,7 @@ from bayes_impedance import terminal
 from bayes_impedance.commands.calibrate import calibrate_command
 from bayes_impedance.commands.inspect import inspect_command
 from bayes_impedance.commands.plan import plan_command
-from bayes_impedance.commands.sample import sample_command
+from bayes_impedance.commands.sample import Given, sample_command
 from bayes_impedance.commands.simulate import simulate_command
 from bayes_impedance.config import load_config, shipped_configurations
 from bayes_impedance.demo import coupling_errors, record, truth_errors
@@ -89,14 +89,6 @@ Logs = Annotated[
         show_default=False,
     ),
 ]
-
-
-class Given(str, Enum):
-    """Forces that infer conditions on."""
-
-    both = "both"
-    training = "training"
-    log = "log"
 
 
 class Competitor(str, Enum):

@@ -18,6 +18,7 @@ from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.sampling.density import JointDensity
 from bayes_impedance.sampling.diagnostics import diagnose
 from bayes_impedance.sampling.draws import Draws
+from bayes_impedance.sampling.importance import TRUSTED_K
 from bayes_impedance.sampling.latents import draw_latents
 from bayes_impedance.sampling.sample import draw
 
@@ -26,8 +27,8 @@ Array = NDArray[np.float64]
 #: Draws of a posterior by what a configuration says of sampling.
 Sampler = Callable[[JointDensity, Config], Draws]
 
-#: R-hat and k of importance weights above which draws are not to be trusted.
-LARGEST_RHAT, LARGEST_PARETO_K = 1.05, 0.7
+#: R-hat of half a chain above which draws are not to be trusted.
+LARGEST_RHAT = 1.05
 
 
 def posterior_draws(density: JointDensity, config: Config) -> Draws:
@@ -124,8 +125,8 @@ def doubts(draws: Draws, wanted: int) -> tuple[str, ...]:
         found.append("a chain was lost")
     if "diverging" in draws.stats and bool(np.any(draws.stats["diverging"])):
         found.append("divergences")
-    if draws.pareto_k is not None and not draws.pareto_k <= LARGEST_PARETO_K:
-        found.append(f"Pareto k above {LARGEST_PARETO_K:g}")
+    if draws.pareto_k is not None and not draws.pareto_k <= TRUSTED_K:
+        found.append(f"Pareto k above {TRUSTED_K:g}")
     # Halves, so that one chain can be compared with itself; what did not move has no R-hat, which is doubtful, too.
     halved = replace(draws, standard=_halves(draws.standard))
     diagnosis = diagnose(halved, [str(c) for c in range(draws.standard.shape[-1])])

@@ -10,10 +10,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bayes_impedance.config import Config
 from bayes_impedance.errors import OutputError
+from bayes_impedance.log import digest
 from bayes_impedance.outputs import prepare_folder
 from bayes_impedance.preprocessing import PreparedLog
 
@@ -45,7 +44,7 @@ def fingerprint(config: Config, motion: PreparedLog, seed: int, thinned: int) ->
         "seed": seed,
         "draws of a rank": thinned,
         "configuration": hashlib.sha256(config.model_dump_json().encode()).hexdigest(),
-        "motion": _digest(motion),
+        "motion": digest(motion.header(), motion.arrays()),
     }
 
 
@@ -109,13 +108,6 @@ class Ledger:
                 f"{self.path}: expected the records of this calibration, found those of one with another "
                 f"{' and '.join(differing)}; choose another --out, or delete the file to start anew"
             )
-
-
-def _digest(motion: PreparedLog) -> str:
-    digest = hashlib.sha256(json.dumps(motion.header()).encode())
-    for name, values in sorted(motion.arrays().items()):
-        digest.update(name.encode() + np.ascontiguousarray(values).tobytes())
-    return digest.hexdigest()
 
 
 def _unusable(path: Path, error: OSError) -> OutputError:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
+import time
 from collections import Counter
 from collections.abc import Callable, Generator
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -179,8 +180,9 @@ def _records(trials: Trials, missing: list[int], processes: int) -> Generator[Re
             mine = set(multiprocessing.active_children()) - others
             for process in mine:
                 process.terminate()
-            for process in mine:
-                process.join()
+            # A thread of the pool may be the one to hear of their end, and then a join here returns before it is noted.
+            while mine & set(multiprocessing.active_children()):
+                time.sleep(0.01)
             raise
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
@@ -16,6 +15,7 @@ from rich.table import Table
 from bayes_impedance.calibration.draw import Settings
 from bayes_impedance.calibration.run import Calibration, calibrate
 from bayes_impedance.calibration.run import Progress as Hook
+from bayes_impedance.commands.sample import Method
 from bayes_impedance.config import Config, as_functions, load_config, shipped_configurations
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.outputs import check_writable, write_json
@@ -27,14 +27,6 @@ from bayes_impedance.simulation.generative import repeated_motion
 #: Of a repetition of synthetic motion [s].
 DURATION = 4.0
 MOTION = "Motion"
-
-
-class Method(str, Enum):
-    """Methods of sampling."""
-
-    nuts = "nuts"
-    svi = "svi"
-    laplace = "laplace"
 
 
 def calibrate_command(

@@ -30,7 +30,7 @@ class Method(str, Enum):
     laplace = "laplace"
 
 
-class Forces(str, Enum):
+class Given(str, Enum):
     """Forces that are conditioned on."""
 
     both = "both"
@@ -48,8 +48,8 @@ def sample_command(
     ],
     out: Annotated[Path, typer.Option(help="netCDF to write, in the schema of ArviZ: POSTERIOR.nc.")],
     given: Annotated[
-        Forces, typer.Option(help="Forces to condition on: those trained on, those of LOG, or both.")
-    ] = Forces.both,
+        Given, typer.Option(help="Forces to condition on: those trained on, those of LOG, or both.")
+    ] = Given.both,
     method: Annotated[
         Method | None,
         typer.Option(
@@ -81,7 +81,7 @@ def sample_command(
     trained = load_model(model)
     settings = _settings(trained.config, overrides or [], method)
     _check_method(settings, unfinished)
-    log = read_log(logs, trained.config.log, require_force=given is Forces.log)
+    log = read_log(logs, trained.config.log, require_force=given is Given.log)
     if figures is not None:
         prepare_folder(figures)
         check_writable(figures / "force.png")

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from bayes_impedance.identifiability import rounded
+from bayes_impedance.impedance_functions.symmetric import entries
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
 from bayes_impedance.plotting.panels import (
     MEASURED,
@@ -58,15 +59,13 @@ def plot_drawn_impedance(posterior: DrawnPosterior, group: int = 0) -> Figure:
     An entry a column: the diagonal, then, where axes are coupled, what stands beside it, on a linear scale.
     """
     axes = posterior.axes
-    entries = [(a, a) for a in range(len(axes))]
-    if posterior.coupled:
-        entries += [(a, b) for a in range(len(axes)) for b in range(a + 1, len(axes))]
+    shown = entries(len(axes), posterior.coupled)
     figure, grid = panel_grid(
         len(IMPEDANCE_ORDER),
-        len(entries),
+        len(shown),
         sharex="all",
         sharey="none",
-        width=4.6 if len(entries) < 3 else 4.0,
+        width=4.6 if len(shown) < 3 else 4.0,
     )
     own = posterior.places_of(group)
     abscissa, name = posterior.abscissa(group)
@@ -75,7 +74,7 @@ def plot_drawn_impedance(posterior: DrawnPosterior, group: int = 0) -> Figure:
     said = {(one.verdict.latent, one.verdict.axis): one.verdict for one in posterior.verdicts}
     for row, latent in enumerate(IMPEDANCE_ORDER):
         matrices = posterior.of_group(posterior.matrices(latent), group)
-        for column, (a, b) in enumerate(entries):
+        for column, (a, b) in enumerate(shown):
             ax = grid[row][column]
             low, high = np.quantile(prior[latent][:, own, a, b], [0.05, 0.95], axis=0)
             for i, piece in enumerate(pieces):

@@ -18,7 +18,7 @@ from bayes_impedance.errors import LogError
 from bayes_impedance.log import Array, InteractionLog, Trial
 from bayes_impedance.preprocessing.grid import check_phase_length, on_even_grid, place, repetitions
 from bayes_impedance.preprocessing.phase import along_path
-from bayes_impedance.preprocessing.prepared import ARRAYS, PreparedLog, PreparedTrial
+from bayes_impedance.preprocessing.prepared import PreparedLog, PreparedTrial
 from bayes_impedance.preprocessing.savitzky_golay import SavitzkyGolay, choose_filter
 from bayes_impedance.preprocessing.segmentation import segment
 from bayes_impedance.preprocessing.warping import align
@@ -206,13 +206,7 @@ def _by_repetition(trial: PreparedTrial) -> list[PreparedTrial]:
     if len(parts) == 1:
         return [trial]
     return [
-        replace(
-            trial,
-            name=f"{trial.name}.{number}",
-            **{key: value[part] for key in ARRAYS if (value := getattr(trial, key)) is not None},
-            truth={key: value[part] for key, value in trial.truth.items()},
-        )
-        for number, part in enumerate(parts, start=1)
+        replace(trial.part(part), name=f"{trial.name}.{number}") for number, part in enumerate(parts, start=1)
     ]
 
 
@@ -234,9 +228,4 @@ def _stride(trial: PreparedTrial, step: float, rate: float | None) -> int:
 
 def _thinned(trial: PreparedTrial, every: int) -> PreparedTrial:
     """Each sample that is a multiple of `every` away from the first."""
-    if every == 1:
-        return trial
-    changes: dict[str, Any] = {
-        name: value[::every] for name in ARRAYS if (value := getattr(trial, name)) is not None
-    }
-    return replace(trial, **changes, truth={name: value[::every] for name, value in trial.truth.items()})
+    return trial if every == 1 else trial.part(slice(None, None, every))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
 
 import numpy as np
@@ -68,6 +68,13 @@ class PreparedTrial:
         if self.force is None:
             return np.zeros(self.n_samples, dtype=bool)
         return np.asarray(np.isfinite(self.force).all(axis=1))
+
+    def part(self, rows: slice | Integers) -> Self:
+        """The same trial with some of its samples."""
+        arrays: dict[str, Any] = {
+            name: value[rows] for name in ARRAYS if (value := getattr(self, name)) is not None
+        }
+        return replace(self, **arrays, truth={name: value[rows] for name, value in self.truth.items()})
 
     def __repr__(self) -> str:
         """Name, group, source and size."""

@@ -7,7 +7,6 @@ of both.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from bayes_impedance.errors import OutputError
+from bayes_impedance.log import digest
 from bayes_impedance.outputs import prepare_folder, whole_file
 
 #: Under which the header of a file of safetensors keeps strings of ours.
@@ -59,7 +59,7 @@ class Checkpoint:
         about = dict(self.fingerprint)
         prepare_folder(self.folder)
         with whole_file(self.path(chain)) as temporary:
-            temporary.write_bytes(save(arrays, {**about, DIGEST: _digest(arrays, about)}))
+            temporary.write_bytes(save(arrays, {**about, DIGEST: digest(about, arrays)}))
 
     def read(self, chain: int) -> dict[str, NDArray[np.generic]] | None:
         """State that was kept of a chain, None where none was.
@@ -78,7 +78,7 @@ class Checkpoint:
             ) from error
         try:
             arrays, about = load(content), _metadata(content)
-            whole = about.pop(DIGEST, None) == _digest(arrays, about)
+            whole = about.pop(DIGEST, None) == digest(about, arrays)
         except (SafetensorError, ValueError, KeyError, TypeError, AttributeError):
             whole = False
         if not whole:
@@ -108,12 +108,3 @@ class Checkpoint:
 def _metadata(content: bytes) -> dict[str, str]:
     length = int.from_bytes(content[:8], "little")
     return dict(json.loads(content[8 : 8 + length])[METADATA])
-
-
-def _digest(arrays: Mapping[str, NDArray[np.generic]], about: Mapping[str, str]) -> str:
-    digest = hashlib.blake2b(json.dumps(dict(about), sort_keys=True).encode(), digest_size=16)
-    for name in sorted(arrays):
-        values = arrays[name]
-        digest.update(f"{name} {values.dtype.str} {values.shape}".encode())
-        digest.update(values.tobytes())
-    return digest.hexdigest()

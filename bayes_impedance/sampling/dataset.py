@@ -86,7 +86,7 @@ def _site(posterior: DrawnPosterior, parameter: Parameter, values: Array) -> dic
     if parameter.median is None:
         quantity = parameter.name.removesuffix("_weights")
         layout = ("chain", "draw", "group", f"{quantity}_entry", f"{quantity}_weight")
-        named = {f"{quantity}_entry": posterior.entry_names(parameter.shape[1])}
+        named = {f"{quantity}_entry": posterior.entry_names()}
         weights = xarray.DataArray(values, dims=layout, coords=named, attrs={"units": "1"})
         return {parameter.name: weights}
     result = {}

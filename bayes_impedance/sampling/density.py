@@ -124,9 +124,8 @@ class JointDensity(SampledDensity):
         hyperparameters = self.parameters[len(QUANTITIES) :]
         self._medians = _joined([p.median.expand(p.shape) for p in hyperparameters if p.median is not None])
         self._log_sds = _joined([p.log_sd.expand(p.shape) for p in hyperparameters if p.log_sd is not None])
-        medians = {p.name: p.median.expand(p.shape) for p in self.parameters if p.median is not None}
         with torch.no_grad():
-            processes = self.processes(medians)
+            processes = self.processes(self.values(torch.zeros(self.size, dtype=torch.float64)))
             self._fixed = tuple(
                 None if self.varies(name) else function.design(features.inputs)
                 for name, function in zip(QUANTITIES, self._functions, strict=True)

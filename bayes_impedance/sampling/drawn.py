@@ -85,10 +85,9 @@ class DrawnPosterior:
             for name, value in self.density.values(torch.from_numpy(self.draws.standard)).items()
         }
 
-    def entry_names(self, count: int) -> list[str]:
+    def entry_names(self) -> list[str]:
         """Names of the free entries of a matrix: xx, yy, then xy."""
-        places = entries(len(self.axes), count > len(self.axes))
-        return [self.axes[a] + self.axes[b] for a, b in places]
+        return [self.axes[a] + self.axes[b] for a, b in entries(len(self.axes), self.coupled)]
 
     def is_constant(self, latent: Latent) -> bool:
         """Whether K, D or M does not depend on an input."""

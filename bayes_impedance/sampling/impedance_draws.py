@@ -18,6 +18,7 @@ from bayes_impedance.impedance_functions.threads import one_thread
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
 from bayes_impedance.kernels.warped import evaluate
 from bayes_impedance.sampling.density import JointDensity, weights
+from bayes_impedance.sampling.latents import DesignsAt
 
 Array = NDArray[np.float64]
 
@@ -33,10 +34,11 @@ def draw_impedance(
     """
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
+        there = DesignsAt(target)
         middle = density.functions(density.values(torch.from_numpy(standard.mean(axis=0))))
         roots = [_correlation_root(function, target) for function in middle]
         found = [
-            _draw(density, torch.from_numpy(row), target, roots, generator)
+            _draw(density, torch.from_numpy(row), there, roots, generator)
             for row in np.asarray(standard, dtype=np.float64)
         ]
     return {latent: np.stack([one[j] for one in found]) for latent, j in IMPEDANCE_ORDER.items()}
@@ -45,17 +47,19 @@ def draw_impedance(
 def _draw(
     density: JointDensity,
     standard: Tensor,
-    target: Features,
+    there: DesignsAt,
     roots: list[Tensor | None],
     generator: torch.Generator,
 ) -> list[Array]:
     values = density.values(standard)
+    known = there.designs(density.functions(values))
     matrices = []
-    for function, own, root in zip(density.functions(values), weights(values), roots, strict=True):
-        design = function.design(target.inputs)
+    for function, design, own, root in zip(
+        known.functions, known.designs, weights(values), roots, strict=True
+    ):
         logarithm = function.logarithm(design, own)
         if root is not None:
-            deviation = function.left_out(target.inputs, design).sqrt()
+            deviation = function.left_out(there.target.inputs, design).sqrt()
             noise = torch.randn((*root.shape[:-1], 1), generator=generator, dtype=torch.float64)
             logarithm = logarithm + (deviation * (root @ noise)[..., 0]).transpose(1, 2)
         matrices.append(function.exponential(logarithm).numpy())

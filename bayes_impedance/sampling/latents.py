@@ -50,7 +50,7 @@ def draw_latents(
         latent: np.empty((count, *(square if latent in IMPEDANCE_ORDER else shape)))
         for latent in (*LATENTS, *IMPEDANCE_ORDER)
     }
-    there = _At(target)
+    there = DesignsAt(target)
     with torch.no_grad():
         values = density.values(torch.from_numpy(np.asarray(standard, dtype=np.float64)))
         for i in range(count):
@@ -72,13 +72,14 @@ def draw_latents(
 
 
 @dataclass
-class _At:
+class DesignsAt:
     """Designs at the samples of `target`; of a function that stays the same from draw to draw there is but one."""
 
     target: Features
     known: dict[int, tuple[ImpedanceFunction, Tensor]] = field(default_factory=dict)
 
     def designs(self, functions: tuple[ImpedanceFunction, ...]) -> Designs:
+        """Those of K, D and M."""
         for j, function in enumerate(functions):
             if j not in self.known or self.known[j][0] is not function:
                 self.known[j] = function, function.design(self.target.inputs)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -101,10 +101,7 @@ def _every_repetition(log: PreparedLog, group: str) -> Iterator[PreparedTrial]:
     for trial in log.trials:
         if trial.group == group:
             for number in np.unique(trial.repetition):
-                rows = np.flatnonzero(trial.repetition == number)
-                arrays = {name: getattr(trial, name) for name in ARRAYS}
-                own: dict[str, Any] = {k: None if v is None else v[rows] for k, v in arrays.items()}
-                yield replace(trial, **own, truth={})
+                yield trial.part(np.flatnonzero(trial.repetition == number))
 
 
 def _phase(trial: PreparedTrial) -> Array:

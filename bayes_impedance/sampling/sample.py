@@ -145,9 +145,8 @@ def _fingerprint(problem: Problem, inducing: tuple[Tensor | None, ...]) -> dict[
         # Those of a model that was trained on another log are others.
         "choice of inducing inputs": hashlib.sha256(b"".join(inputs)).hexdigest()[:16],
         "prior mean of the desired trajectory": hashlib.sha256(b"".join(means)).hexdigest()[:16],
+        # Those of torch and Pyro are among what chains depend on.
         "bayes_impedance": version("bayes-impedance"),
-        "torch": version("torch"),
-        "pyro": version("pyro-ppl"),
     }
 
 

@@ -39,10 +39,9 @@ class Start:
 def find_start(
     density: SampledDensity,
     training: TrainingConfig,
-    near: Array | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> Start:
-    """Climb from `near`, or from the prior mean.
+    """Climb from the prior mean.
 
     A joint mode of functions and noise takes the noise for less than it is; so hyperparameters maximise the evidence
     (docs/model.md §15), about which the posterior lies.
@@ -50,10 +49,9 @@ def find_start(
     Raises:
         NotPositiveDefiniteError: the density is not finite somewhere on the way.
     """
-    begin = np.zeros(density.size) if near is None else near
     point, precision, climb = take_turns(
         density,
-        begin,
+        np.zeros(density.size),
         training.max_iterations,
         training.gradient_tolerance,
         progress,

@@ -19,6 +19,7 @@ from bayes_impedance.identifiability import (
     rounded,
     verdict_sentence,
 )
+from bayes_impedance.impedance_functions.symmetric import entries
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
 
 Array = NDArray[np.float64]
@@ -114,15 +115,12 @@ def exact_off_diagonals(evidence: Evidence, axes: Sequence[str]) -> list[OffDiag
     """What couples axes in stiffness, damping and mass, averaged over places."""
     listed = []
     for latent in IMPEDANCE_ORDER:
-        for a in range(len(axes)):
-            for b in range(a + 1, len(axes)):
-                draws, prior = (part[latent][..., a, b] for part in (evidence.impedance, evidence.prior))
-                before = prior.var(axis=0).mean()
-                contraction = float(1.0 - draws.var(axis=0).mean() / before) if before > 0.0 else 0.0
-                mean = float(draws.mean())
-                listed.append(
-                    OffDiagonal(latent, axes[a] + axes[b], mean, *_bands(draws, prior), contraction)
-                )
+        for a, b in entries(len(axes), coupled=True)[len(axes) :]:
+            draws, prior = (part[latent][..., a, b] for part in (evidence.impedance, evidence.prior))
+            before = prior.var(axis=0).mean()
+            contraction = float(1.0 - draws.var(axis=0).mean() / before) if before > 0.0 else 0.0
+            mean = float(draws.mean())
+            listed.append(OffDiagonal(latent, axes[a] + axes[b], mean, *_bands(draws, prior), contraction))
     return listed
 
 
