@@ -95,6 +95,14 @@ class FeatureMap:
         """Input columns of some components of ξ."""
         return tuple(column for component in components for column in self._columns[f"xi.{component}"])
 
+    def columns_of(self, component: str) -> tuple[int, ...]:
+        """Input columns of one component, of θ or else of ξ; none where the model does not depend on it."""
+        if component not in self.theta:
+            return self._columns.get(f"xi.{component}", ())
+        before = self.theta[: self.theta.index(component)]
+        start = sum(self._size(one) for one in before)
+        return self.layout.theta[start : start + self._size(component)]
+
     def labels(self, components: Sequence[str]) -> list[str]:
         """Name of each dimension of a kernel over `components`: time, position_x, …"""
         names: list[str] = []

@@ -13,7 +13,7 @@ import torch
 
 from bayes_impedance.config import Config, SamplingConfig, as_functions, load_config
 from bayes_impedance.device import follow_law
-from bayes_impedance.engines.choice import MOMENTS, EngineChoice
+from bayes_impedance.engines.choice import LOCAL, MOMENTS, EngineChoice
 from bayes_impedance.engines.dense import Observations, check_capacity
 from bayes_impedance.engines.pointwise import PointPredictor
 from bayes_impedance.errors import ConfigurationError, LogError
@@ -29,6 +29,7 @@ from bayes_impedance.journal import Journal
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.log import InteractionLog
 from bayes_impedance.posterior import Posterior, compute_posterior
+from bayes_impedance.posterior.local import local_posterior
 from bayes_impedance.preprocessing import PreparedLog, prepare
 from bayes_impedance.priors import Entry, ForceModel, build_force_model
 from bayes_impedance.sampling.drawn import DrawnPosterior
@@ -110,6 +111,11 @@ class ImpedanceModel:
         They have one together where they are coupled, or impedance is a function.
         """
         return self._parts(self.fitted.log.axes)
+
+    @property
+    def trajectory_mean(self) -> TrajectoryMean:
+        """Prior mean of the desired trajectory, as learned from the training log."""
+        return self._mean(self.fitted.log)
 
     @property
     def hyperparameters(self) -> tuple[Entry, ...]:
@@ -198,11 +204,15 @@ class ImpedanceModel:
         # One labelling for both, so that a trial that is target and evidence keeps its own x_d and ũ.
         labels = label_trials(*([prepared] if evidence is None else [prepared, evidence]))
         if evidence is not None:
-            if functions is None:
+            if functions is None and not self._is_local:
                 self._check_capacity(evidence)
             conditions = feature_map(evidence, mean, labels, observed=True)
         target = feature_map(prepared, mean, labels)
         model = self._force_model(feature_map)
+        if self._is_local:
+            return local_posterior(
+                model, feature_map, self.config.engine.local, prepared, target, conditions, latents
+            )
         if functions is None:
             return compute_posterior(model, prepared, target, conditions, self.config.engine.jitter, latents)
         conditioned = None
@@ -327,6 +337,8 @@ class ImpedanceModel:
             ConfigurationError: impedance is a function, and the model is not fitted: the log decides.
         """
         if not self._is_function:
+            if self._is_local:
+                return EngineChoice("local", LOCAL)
             return EngineChoice("dense", MOMENTS)
         return self._functions.engine
 
@@ -335,6 +347,10 @@ class ImpedanceModel:
         functions = self.fitted.functions
         assert functions is not None
         return functions
+
+    @property
+    def _is_local(self) -> bool:
+        return self.config.engine.name == "local"
 
     @property
     def _is_function(self) -> bool:

@@ -6,6 +6,7 @@ Sections follow the flow of the data: `log` → `preprocessing` → `model`, `sh
 
 from bayes_impedance.config.inference import BaselineConfig as BaselineConfig
 from bayes_impedance.config.inference import EngineConfig as EngineConfig
+from bayes_impedance.config.inference import LocalConfig as LocalConfig
 from bayes_impedance.config.inference import SamplingConfig as SamplingConfig
 from bayes_impedance.config.inference import TrainingConfig as TrainingConfig
 from bayes_impedance.config.loading import Config as Config

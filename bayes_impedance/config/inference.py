@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
 from bayes_impedance.config.sections import Component, Section
 
 #: Engines by name; `auto` takes the cheapest that computes the same quantity exactly.
-EngineName = Literal["auto", "dense", "markov", "lowrank"]
+EngineName = Literal["auto", "dense", "markov", "lowrank", "local"]
 #: How posteriors are drawn: exactly, in the limit, or by an approximation.
 SamplingMethod = Literal["nuts", "svi", "laplace"]
 #: Family of variational posteriors.
@@ -18,11 +18,29 @@ Guide = Literal["multivariate_normal", "low_rank"]
 ImpedanceInference = Literal["moments", "map"]
 
 
+class LocalConfig(Section):
+    """Local sparse models on a grid of cells, for streams and long logs.
+
+    Each sample belongs to the `active` nearest cells. A cell keeps at most `inducing` inputs, and a sample becomes one
+    of them where it has a share above `novelty` of its prior variance for itself. `width` of a cell by component, in
+    the component's unit: those of θ, each a length scale of the desired trajectory wide, if null. The grid reaches one
+    cell beyond the motion that the model was trained on, with at most `cells` of them in use. `forgetting`: samples of
+    a cell after which one weighs 1/e; null keeps all.
+    """
+
+    inducing: int = Field(default=50, ge=2, le=2000)
+    active: int = Field(default=3, ge=1, le=9)
+    novelty: float = Field(default=1e-3, ge=0, lt=1)
+    width: dict[Component, Annotated[float, Field(gt=0)]] | None = None
+    cells: int = Field(default=1000, ge=1)
+    forgetting: float | None = Field(default=None, gt=0)
+
+
 class EngineConfig(Section):
     """How the likelihood of the forces is computed.
 
-    `impedance: moments` integrates stiffness, damping and mass out to second order, which only the dense engine does;
-    `map` estimates them as functions, with a Laplace covariance, from the likelihood given impedance, which every
+    `impedance: moments` integrates stiffness, damping and mass out to second order, which the dense engine does, and for
+    posteriors of long logs `local` does by local sparse models of the same covariance; training is dense in both. `map` estimates them as functions, with a Laplace covariance, from the likelihood given impedance, which every
     engine computes. `inducing` inputs carry each such function. `max_samples` and `jitter`, relative to the mean prior
     variance of force, are of the dense engine.
     """
@@ -32,6 +50,7 @@ class EngineConfig(Section):
     inducing: int = Field(default=12, ge=2, le=200)
     max_samples: int = Field(default=4000, ge=2)
     jitter: float = Field(default=1e-10, ge=0, le=1e-3)
+    local: LocalConfig = LocalConfig()
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -39,6 +58,11 @@ class EngineConfig(Section):
             raise ValueError(
                 f"name: expected auto or dense with impedance: moments, got {self.name}, which computes the likelihood "
                 "given impedance; set engine.impedance=map"
+            )
+        if self.impedance == "map" and self.name == "local":
+            raise ValueError(
+                "name: expected auto, dense, markov or lowrank with impedance: map, got local, whose covariance has "
+                "impedance integrated out; set engine.impedance=moments"
             )
         return self
 

@@ -15,6 +15,7 @@ from bayes_impedance.features import Features
 #: Forces up to which dense is taken unasked: finding functions takes hundreds of evaluations, of a second each there.
 FEW = 1500
 MOMENTS = "stiffness, damping and mass are integrated out, which only dense covariances do"
+LOCAL = "asked for by engine.name; training is dense, posteriors come from local sparse models of the same covariance"
 
 
 @dataclass(frozen=True)

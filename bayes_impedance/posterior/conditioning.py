@@ -23,12 +23,11 @@ def entry_of(model: ForceModel, name: str) -> Entry:
     return next(entry for entry in model.entries if entry.name == name)
 
 
-def offset_covariance(white_loading: Tensor, variance: Tensor) -> Tensor:
+def offset_covariance(gram: Tensor, variance: Tensor) -> Tensor:
     """Covariance of offsets b ~ N(0, diag V) that load on forces by A, given these: V½ (I + V½ AᵀK⁻¹A V½)⁻¹ V½.
 
-    `white_loading` L⁻¹A `(*batch, n, b)`, `variance` V `(*batch, b)`; defined for V = 0 too.
+    `gram` AᵀK⁻¹A `(*batch, b, b)`, `variance` V `(*batch, b)`; defined for V = 0 too.
     """
-    gram = white_loading.mT @ white_loading
     root = variance.sqrt()
     scaled = root.unsqueeze(-1) * gram * root.unsqueeze(-2)
     inner = torch.linalg.inv(torch.eye(gram.shape[-1], dtype=gram.dtype) + scaled)

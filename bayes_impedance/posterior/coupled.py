@@ -152,7 +152,7 @@ class CoupledConditioner:
             forces = observations(model, given)
             self.factor = Factor(self.kernel, forces, jitter)
             self.white_loading = self.factor.whiten(self._level_loading(self.inputs))
-            self.level_covariance = offset_covariance(self.white_loading, self.variance)
+            self.level_covariance = offset_covariance(self.white_loading.mT @ self.white_loading, self.variance)
             self.loop: CoupledLoopEvidence | None = None
             if given.loop is not None:
                 self.loop = CoupledLoopEvidence(self.kernel.impedance, self.factor, forces, given.loop)

@@ -34,11 +34,11 @@ class IndependentConditioner:
         self.model, self.given = model, given
         forces = observations(model, given)
         self.factor = Factor(model.kernel, forces, jitter)
-        variance = _level_variance(model)
+        variance = level_variance(model)
         self.has_levels = variance is not None
         if variance is not None:
-            self.white_loading = self.factor.whiten(_level_loading(model, given.inputs, Latent.FORCE))
-            self.level_covariance = offset_covariance(self.white_loading, variance)
+            self.white_loading = self.factor.whiten(level_loading(model, given.inputs, Latent.FORCE))
+            self.level_covariance = offset_covariance(self.white_loading.mT @ self.white_loading, variance)
         self.loop = None
         if given.loop is not None:
             self.loop = LoopEvidence(model.kernel.impedance, self.factor, forces, given.loop)
@@ -59,7 +59,7 @@ class IndependentConditioner:
     def _chunk(self, target: Features, latent: Latent) -> Moments:
         cross = _cross_covariance(self.model, self.given.inputs, target.inputs, latent)
         white = self.factor.whiten(cross)
-        prior = _prior(self.model, target, latent)
+        prior = prior_of(self.model, target, latent)
         # On padding α is zero.
         location = prior.location + (cross.mT @ self.factor.alpha.unsqueeze(-1)).squeeze(-1)
         # Rounding can push the variance of a fully determined variable just below zero.
@@ -93,7 +93,7 @@ def prior_only(model: ForceModel, target: Features, latents: Sequence[Latent]) -
     result = {}
     shape = target.inputs.shape[:-1]
     for latent in latents:
-        prior = _prior(model, target, latent)
+        prior = prior_of(model, target, latent)
         location, variance = prior.location.expand(shape), prior.variance.expand(shape)
         result[latent] = (location, variance, prior.shown.expand(shape), variance)
     return result
@@ -112,7 +112,7 @@ def _own_variance(model: ForceModel, target: Features, latent: Latent) -> Tensor
     return model.kernel(target.inputs, diag=True)
 
 
-class _Prior(NamedTuple):
+class Prior(NamedTuple):
     """Prior of a latent at some samples, `(axes, groups, m)` each or what broadcasts to it.
 
     `location` at the fitted levels, `shown` before training; `own_variance` at known levels and without noise,
@@ -126,28 +126,29 @@ class _Prior(NamedTuple):
     loading: Tensor
 
 
-def _prior(model: ForceModel, target: Features, latent: Latent) -> _Prior:
+def prior_of(model: ForceModel, target: Features, latent: Latent) -> Prior:
+    """Prior of a latent at the samples of `target`."""
     own = _own_variance(model, target, latent)
-    loading = _level_loading(model, target.inputs, latent)
-    levels = _level_variance(model)
+    loading = level_loading(model, target.inputs, latent)
+    levels = level_variance(model)
     variance = own if levels is None else own + (loading.square() * levels.unsqueeze(-2)).sum(-1)
     if latent is Latent.FORCE:
         location = model.prior_mean(target.inputs)
-        return _Prior(location, location, own, variance + model.noise_variance, loading)
+        return Prior(location, location, own, variance + model.noise_variance, loading)
     if latent is Latent.RESIDUAL_FORCE:
         location = torch.zeros_like(own)
-        return _Prior(location, location, own, variance, loading)
+        return Prior(location, location, own, variance, loading)
     if latent in TRAJECTORY_ORDER:
         location = target.trajectory_mean[..., TRAJECTORY_ORDER[latent]]
-        return _Prior(location, location, own, variance, loading)
+        return Prior(location, location, own, variance, loading)
     process = model.kernel.impedance.processes[IMPEDANCE_ORDER[latent]]
     level, median = process.level[..., 0], entry_of(model, f"{latent.value}.level").medians
     if process.law == "log_gaussian":
         level, median = level.log(), median.log()
-    return _Prior(level, median, own, variance, loading)
+    return Prior(level, median, own, variance, loading)
 
 
-def _level_variance(model: ForceModel) -> Tensor | None:
+def level_variance(model: ForceModel) -> Tensor | None:
     """Var[b_j], `(axes, 1, 3)`; None for a naive GP."""
     if not isinstance(model.kernel, InteractionKernel):
         return None
@@ -162,7 +163,7 @@ def _level_variance(model: ForceModel) -> Tensor | None:
     return torch.cat(variances, dim=-1)
 
 
-def _level_loading(model: ForceModel, inputs: Tensor, latent: Latent) -> Tensor:
+def level_loading(model: ForceModel, inputs: Tensor, latent: Latent) -> Tensor:
     """Derivative of the latent's prior location by each b_j, `(axes, groups, n, 3)`; zero for a naive GP."""
     loading = inputs.new_zeros(*inputs.shape[:-1], len(IMPEDANCE_ORDER))
     if latent in IMPEDANCE_ORDER:

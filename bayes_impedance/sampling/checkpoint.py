@@ -7,23 +7,16 @@ of both.
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError
-from safetensors.numpy import load, save
 
 from bayes_impedance.errors import OutputError
-from bayes_impedance.log import digest
-from bayes_impedance.outputs import prepare_folder, whole_file
-
-#: Under which the header of a file of safetensors keeps strings of ours.
-METADATA = "__metadata__"
-DIGEST = "digest"
+from bayes_impedance.outputs import prepare_folder
+from bayes_impedance.sealed import DamagedFileError, read_sealed, write_sealed
 
 
 @dataclass(frozen=True)
@@ -55,11 +48,8 @@ class Checkpoint:
         Raises:
             OutputError: it cannot be written.
         """
-        arrays = {name: np.array(values, order="C") for name, values in state.items()}
-        about = dict(self.fingerprint)
         prepare_folder(self.folder)
-        with whole_file(self.path(chain)) as temporary:
-            temporary.write_bytes(save(arrays, {**about, DIGEST: digest(about, arrays)}))
+        write_sealed(self.path(chain), state, self.fingerprint)
 
     def read(self, chain: int) -> dict[str, NDArray[np.generic]] | None:
         """State that was kept of a chain, None where none was.
@@ -69,23 +59,18 @@ class Checkpoint:
         """
         path = self.path(chain)
         try:
-            content = path.read_bytes()
+            arrays, about = read_sealed(path)
         except FileNotFoundError:
             return None
         except OSError as error:
             raise OutputError(
                 f"{path}: expected a checkpoint that can be read, got: {error.strerror}; delete it to start anew"
             ) from error
-        try:
-            arrays, about = load(content), _metadata(content)
-            whole = about.pop(DIGEST, None) == digest(about, arrays)
-        except (SafetensorError, ValueError, KeyError, TypeError, AttributeError):
-            whole = False
-        if not whole:
+        except DamagedFileError as error:
             raise OutputError(
                 f"{path}: expected the checkpoint of a chain, found a damaged file; delete it, and that chain starts "
                 "anew"
-            )
+            ) from error
         for name in {**self.fingerprint, **about}:
             mine, theirs = self.fingerprint.get(name), about.get(name)
             if mine != theirs:
@@ -103,8 +88,3 @@ class Checkpoint:
         # Whatever else somebody has put there stays.
         with contextlib.suppress(OSError):
             self.folder.rmdir()
-
-
-def _metadata(content: bytes) -> dict[str, str]:
-    length = int.from_bytes(content[:8], "little")
-    return dict(json.loads(content[8 : 8 + length])[METADATA])

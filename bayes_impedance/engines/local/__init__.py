@@ -1,0 +1,1 @@
+"""Local sparse models: cells of a grid that learn sample by sample."""

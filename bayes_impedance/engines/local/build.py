@@ -1,0 +1,77 @@
+"""A local model for a force model and the motion that it was trained on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from bayes_impedance.config import LocalConfig
+from bayes_impedance.engines.local.grid import Grid
+from bayes_impedance.engines.local.model import LocalModel
+from bayes_impedance.engines.local.numbers import KernelNumbers
+from bayes_impedance.errors import ConfigurationError
+from bayes_impedance.features import FeatureMap
+from bayes_impedance.priors import ForceModel
+
+Floats = NDArray[np.float64]
+
+#: Most cells that a grid may have: their numbers must fit into 64 bits, with room to spare.
+MOST = 2**53
+
+
+def build_local(
+    model: ForceModel, feature_map: FeatureMap, settings: LocalConfig, visited: Floats
+) -> LocalModel:
+    """Empty cells over the range of `visited` `(n, D)`, inputs of an axis, one cell more on every side.
+
+    Raises:
+        ConfigurationError: the model is none that local models hold, or the widths fit no grid.
+    """
+    numbers = KernelNumbers.of(model.kernel, feature_map.width)
+    axes = len(feature_map.axes)
+    with torch.no_grad():
+        noise = model.noise_variance.expand(axes, 1, 1).reshape(axes).numpy().copy()
+    widths = settings.width or _length_scales(model, feature_map)
+    columns, width = [], []
+    for component, value in widths.items():
+        own = feature_map.columns_of(component)
+        if not own:
+            known = ", ".join(dict.fromkeys((*feature_map.theta, *feature_map.xi)))
+            raise ConfigurationError(
+                f"engine.local.width: expected components that the model depends on ({known}), got {component}; remove "
+                "it, or name another"
+            )
+        columns += own
+        width += [value] * len(own) if np.ndim(value) == 0 else list(np.ravel(value))
+    return LocalModel(numbers, noise, _grid(visited[:, columns], columns, np.array(width)), settings, feature_map.width)
+
+
+def _grid(visited: Floats, columns: list[int], width: Floats) -> Grid:
+    low, high = visited.min(axis=0), visited.max(axis=0)
+    inner = np.floor((high - low) / width) + 1.0
+    # Centred: the first and the last place visited lie inside of a cell, not at its border.
+    lower = 0.5 * (low + high) - (0.5 * inner + 1.0) * width
+    cells = inner + 2.0
+    if math.prod(cells.tolist()) > MOST:
+        raise ConfigurationError(
+            f"engine.local.width: expected cells of which at most {MOST:g} cover the range of motion, got "
+            f"{np.format_float_scientific(math.prod(cells.tolist()), 1)}; widen them"
+        )
+    return Grid(np.array(columns), lower, width, cells.astype(np.int64))
+
+
+def _length_scales(model: ForceModel, feature_map: FeatureMap) -> Mapping[str, Floats]:
+    """Of the desired trajectory, by component of θ; of axes that differ the shortest."""
+    scales = model.kernel.impedance.trajectory.lengthscale.detach()
+    size = len(feature_map.layout.theta)
+    shortest = scales.expand(*scales.shape[:-1], size).reshape(-1, size).amin(0).numpy()
+    found, start = {}, 0
+    for component in feature_map.theta:
+        count = len(feature_map.columns_of(component))
+        found[component] = shortest[start : start + count]
+        start += count
+    return found

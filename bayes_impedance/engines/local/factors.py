@@ -1,0 +1,90 @@
+"""Triangular factors that grow by a row and learn by a rotation, compiled; each costs O(B²).
+
+The factor of what never changes is a lower triangular L, A = L Lᵀ, that of what learns an upper one U, A = UᵀU, so that
+every inner loop runs along a row. Of each the first `count` rows and columns are in use.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+def solve(lower: Floats, count: int, b: Floats) -> None:
+    """b ← L⁻¹ b in place."""
+    for k in range(count):
+        value = b[k]
+        for i in range(k):
+            value -= lower[k, i] * b[i]
+        b[k] = value / lower[k, k]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def solve_transposed(upper: Floats, count: int, b: Floats) -> None:
+    """b ← U⁻ᵀ b in place."""
+    for k in range(count):
+        value = b[k] / upper[k, k]
+        b[k] = value
+        for i in range(k + 1, count):
+            b[i] -= value * upper[k, i]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def rotate(upper: Floats, count: int, d: Floats, x: Floats, y: float) -> None:
+    """One observation y = x·w + N(0, 1): UᵀU gains x xᵀ and Uᵀd gains x y; `x` is used up.
+
+    Givens rotations of the rows of [U d] and [x y]: nothing is subtracted, so that rounding does not pile up.
+    """
+    for k in range(count):
+        r = math.hypot(upper[k, k], x[k])
+        c, s = upper[k, k] / r, x[k] / r
+        upper[k, k] = r
+        for i in range(k + 1, count):
+            value = upper[k, i]
+            upper[k, i] = c * value + s * x[i]
+            x[i] = c * x[i] - s * value
+        value = d[k]
+        d[k] = c * value + s * y
+        y = c * y - s * value
+
+
+@njit(cache=True, nogil=True)
+def factorise(matrix: Floats, count: int, upper: Floats) -> None:
+    """`upper` ← U with UᵀU = I + `matrix`, in the first `count` rows and columns."""
+    for k in range(count):
+        upper[k, k] = 1.0 + matrix[k, k]
+        for i in range(k + 1, count):
+            upper[k, i] = matrix[k, i]
+    for k in range(count):
+        pivot = math.sqrt(upper[k, k])
+        upper[k, k] = pivot
+        for i in range(k + 1, count):
+            upper[k, i] /= pivot
+        for j in range(k + 1, count):
+            value = upper[k, j]
+            for i in range(j, count):
+                upper[j, i] -= value * upper[k, i]
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+def squared_norm(b: Floats, count: int) -> float:
+    """Σ b_k²."""
+    total = 0.0
+    for k in range(count):
+        total += b[k] * b[k]
+    return total
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+def inner(a: Floats, b: Floats, count: int) -> float:
+    """Σ a_k b_k."""
+    total = 0.0
+    for k in range(count):
+        total += a[k] * b[k]
+    return total

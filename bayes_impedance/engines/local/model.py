@@ -1,0 +1,215 @@
+"""Many local models of one force: cells of a grid, each of which learns the samples near it (docs/model.md §17)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from bayes_impedance.config import LocalConfig
+from bayes_impedance.engines.local.cell import (
+    Cell,
+    Sums,
+    choose,
+    empty_cell,
+    learn,
+    moments,
+    place,
+    refresh,
+    whitened,
+)
+from bayes_impedance.engines.local.covariance import variances
+from bayes_impedance.engines.local.grid import Grid, nearest, weights_of
+from bayes_impedance.engines.local.numbers import KernelNumbers
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+#: Samples after which the factor of a cell is computed anew; more often where it forgets, this often in its memory.
+REFRESH, STEPS_OF_MEMORY = 1000, 20
+#: Samples of a cell among which inducing inputs are chosen, evenly spread over them, and samples that are taught at
+#: once: bounds of memory.
+CANDIDATES, BLOCK = 4000, 4096
+
+
+class Coverage(IntEnum):
+    """What a prediction rests on: cells that have learned; no such cell near; a place outside of the grid."""
+
+    LEARNED = 0
+    UNVISITED = 1
+    OUTSIDE = 2
+
+
+class LocalMoments(NamedTuple):
+    """Deviations of force, x_d and ẋ_d from their prior means, `(axes, 3)` [N, m, m/s], and their variances.
+
+    Force is without noise. Where `coverage` says that nothing is known, these are the prior's.
+    """
+
+    mean: Floats
+    variance: Floats
+    coverage: Coverage
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """What is known at one instant; nothing changes it, and any thread may read it.
+
+    `numbers` and `noise` σ_r² `(axes,)` [N²] are hyperparameters; `cells` by their place in the grid, of which the
+    `active` nearest predict.
+    """
+
+    numbers: KernelNumbers
+    noise: Floats
+    grid: Grid
+    active: int
+    cells: Mapping[int, Cell]
+
+    def predict(self, x: Floats) -> LocalMoments:
+        """Moments at the inputs `x` `(axes, D)` of a sample: a mixture of the nearest cells, with its second moment."""
+        prior, codes, weights, inside = _prepare(self.numbers, self.grid, x, self.active)
+        near = [(weight, cell) for code, weight in zip(codes.tolist(), weights.tolist(), strict=True)
+                if (cell := self.cells.get(code)) is not None]  # fmt: skip
+        if not near:
+            coverage = Coverage.UNVISITED if inside else Coverage.OUTSIDE
+            return LocalMoments(np.zeros_like(prior), prior, coverage)
+        means, variances_ = np.empty((2, len(near), *prior.shape))
+        for i, (_, cell) in enumerate(near):
+            moments(self.numbers, cell, x, prior, means[i], variances_[i])
+        weights = np.array([weight for weight, _ in near])
+        return LocalMoments(*mixture(weights, means, variances_), Coverage.LEARNED)
+
+
+@dataclass
+class LocalModel:
+    """Cells that learn, and predictions from them.
+
+    `width` D is the number of columns of an input. One thread learns; a cell is replaced as a whole, never changed, so
+    that others may read at any time.
+    """
+
+    numbers: KernelNumbers
+    noise: Floats
+    grid: Grid
+    settings: LocalConfig
+    width: int
+    cells: dict[int, Cell] = field(default_factory=dict)
+    sums: dict[int, Sums] = field(default_factory=dict)
+
+    @property
+    def view(self) -> Snapshot:
+        """What is known at any time: its cells are those that learn."""
+        return Snapshot(self.numbers, self.noise, self.grid, self.settings.active, self.cells)
+
+    @property
+    def snapshot(self) -> Snapshot:
+        """What is known now."""
+        return replace(self.view, cells=dict(self.cells))
+
+    def learn(self, x: Floats, residual: Floats) -> Coverage:
+        """One sample: inputs `(axes, D)`, u − E[u] `(axes,)` [N]; into the nearest cells.
+
+        A place outside of the grid teaches nothing; nor does one whose cells were never visited, when there are
+        `settings.cells` already (`UNVISITED`).
+        """
+        prior, codes, _, inside = _prepare(self.numbers, self.grid, x, self.settings.active)
+        if not inside:
+            return Coverage.OUTSIDE
+        changed: dict[int, Cell] = {}
+        for code in codes.tolist():
+            cell = self._visit(code, changed)
+            if cell is None:
+                continue
+            sums = self.sums[code]
+            count, posterior, d = learn(
+                self.numbers, self.noise, self.settings.novelty, cell, sums, x, prior[:, 0], residual
+            )
+            if sums.stale[0] >= self.refresh_every:
+                posterior, d = refresh(count, sums, self._keep(int(sums.stale[0])))
+            changed[code] = Cell(count, cell.inputs, cell.prior, posterior, d)
+        # At once, so that a snapshot has a sample in all of its cells or in none.
+        self.cells.update(changed)
+        return Coverage.LEARNED if changed else Coverage.UNVISITED
+
+    def learn_all(self, inputs: Floats, residual: Floats) -> None:
+        """Many samples at once, `(axes, n, D)` and `(axes, n)`, into cells that are empty before.
+
+        Inducing inputs are chosen among all samples of a cell. With the same inducing inputs, and nothing forgotten,
+        this is what `learn` comes to sample by sample.
+        """
+        codes, _ = weights_of(self.grid, inputs[0], self.settings.active)
+        for code in np.unique(codes[codes >= 0]).tolist():
+            rows = np.flatnonzero((codes == code).any(axis=1))
+            cell = self._visit(code)
+            if cell is not None:
+                self.cells[code] = self._taught(cell, self.sums[code], inputs[:, rows], residual[:, rows])
+
+    @property
+    def refresh_every(self) -> int:
+        """Samples after which the factor of a cell is computed anew."""
+        memory = self.settings.forgetting
+        return REFRESH if memory is None else max(1, min(REFRESH, round(memory / STEPS_OF_MEMORY)))
+
+    def _taught(self, cell: Cell, sums: Sums, inputs: Floats, residual: Floats) -> Cell:
+        n = inputs.shape[1]
+        candidates = np.unique(np.linspace(0, n - 1, min(n, CANDIDATES)).astype(int))
+        for axis in range(self.noise.size):
+            among = inputs[axis, candidates]
+            chosen = choose(self.numbers, axis, among, self.settings.inducing, self.settings.novelty)
+            place(self.numbers, axis, cell, among[chosen])
+            for start in range(0, n, BLOCK):
+                block = slice(start, start + BLOCK)
+                white, scaled = whitened(
+                    self.numbers, self.noise[axis], axis, cell, inputs[axis, block], residual[axis, block]
+                )
+                sums.gram[axis] += white.T @ white
+                sums.moment[axis] += white.T @ scaled
+        sums.samples[0] += n
+        posterior, d = refresh(cell.count, sums, 1.0)
+        return cell._replace(posterior=posterior, d=d)
+
+    def _visit(self, code: int, learning: Iterable[int] = ()) -> Cell | None:
+        """A cell, an empty one where it was never visited; None where there is no room beside those `learning`.
+
+        Nobody sees an empty cell before it has learned something.
+        """
+        if code in self.cells:
+            return self.cells[code]
+        if code < 0 or len(self.cells) + sum(one not in self.cells for one in learning) >= self.settings.cells:
+            return None
+        axes, inducing = self.noise.size, self.settings.inducing
+        self.sums[code] = Sums.empty(axes, inducing)
+        return empty_cell(axes, inducing, self.width)
+
+    def _keep(self, samples: int) -> float:
+        """Weight of what a cell was taught before the last `samples`."""
+        memory = self.settings.forgetting
+        return 1.0 if memory is None else float(np.exp(-samples / memory))
+
+
+@njit(cache=True, nogil=True)
+def mixture(weights: Floats, means: Floats, variances_: Floats) -> tuple[Floats, Floats]:
+    """Mean and variance of a mixture, `(axes, 3)`, of members `(members, axes, 3)` with `weights` `(members,)`."""
+    mean, variance = np.zeros(means.shape[1:]), np.zeros(means.shape[1:])
+    total = weights.sum()
+    for i in range(weights.size):
+        mean += weights[i] / total * means[i]
+    for i in range(weights.size):
+        variance += weights[i] / total * (variances_[i] + (means[i] - mean) ** 2)
+    return mean, variance
+
+
+@njit(cache=True, nogil=True)
+def _prepare(numbers: KernelNumbers, grid: Grid, x: Floats, active: int) -> tuple[Floats, Integers, Floats, bool]:
+    """Prior variances, and nearest cells with their weights."""
+    codes, weights = np.full(active, -1), np.zeros(active)
+    inside = nearest(grid, x[0], codes, weights)
+    prior = np.empty((x.shape[0], 3))
+    for axis in range(x.shape[0]):
+        variances(numbers, axis, x[axis], prior[axis])
+    return prior, codes, weights, inside
