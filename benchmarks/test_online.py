@@ -1,0 +1,89 @@
+"""A control loop's share of the clock: update and prediction of one sample, and memory over a million of them.
+
+Two axes, settings of the paper (θ = position and velocity), fifty inducing inputs, three active cells.
+"""
+
+from __future__ import annotations
+
+import resource
+import time
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bayes_impedance import ImpedanceModel, OnlinePredictor, Sample
+from bayes_impedance.simulation.generative import draw_force, repeated_motion
+
+pytestmark = pytest.mark.timeout(0)
+
+SETTINGS = (
+    "shared.residual=true",
+    "model.drop_acceleration=true",
+    "training.restarts=1",
+    "training.max_iterations=20",
+)
+TIMED = 20_000
+MILLION = 1_000_000
+
+
+@pytest.fixture(scope="module")
+def predictor() -> OnlinePredictor:
+    model = ImpedanceModel.from_config("position_velocity", SETTINGS)
+    motion = repeated_motion(repetitions=4, duration=4.0, rate=25.0, axes=("x", "y"))
+    return OnlinePredictor(model.fit(draw_force(model.config, motion, seed=0)))
+
+
+def stream(count: int, begin: float) -> list[Sample]:
+    """Samples along the motion of training at 1 kHz, with white forces: what they teach does not matter here."""
+    motion = repeated_motion(repetitions=4, duration=4.0, rate=1000.0, axes=("x", "y"))
+    parts = [(trial.position, trial.velocity, trial.acceleration) for trial in motion.trials]
+    position, velocity, acceleration = (np.concatenate(part) for part in zip(*parts, strict=True))
+    generator = np.random.default_rng(0)
+    force = generator.standard_normal((count, 2))
+    rows = np.arange(count) % len(position)
+    return [
+        Sample(begin + 1e-3 * t, position[i], velocity[i], force[t], acceleration[i])
+        for t, i in enumerate(rows.tolist())
+    ]
+
+
+def test_update_and_predict(predictor, figures):
+    samples = stream(TIMED + 1000, 1e3)
+    seconds: NDArray[np.float64] = np.empty((len(samples), 2))
+    for i, sample in enumerate(samples):
+        begin = time.perf_counter()
+        predictor.update(sample)
+        between = time.perf_counter()
+        predictor.predict(sample)
+        seconds[i] = between - begin, time.perf_counter() - between
+    both = 1e3 * seconds[1000:].sum(axis=1)
+    median, p99 = np.quantile(both, (0.5, 0.99))
+    figures["online_update_and_predict"] = {
+        "median_milliseconds": median,
+        "p99_milliseconds": p99,
+        "largest_milliseconds": both.max(),
+        "update_median_milliseconds": 1e3 * float(np.median(seconds[1000:, 0])),
+        "predict_median_milliseconds": 1e3 * float(np.median(seconds[1000:, 1])),
+        "cells": predictor.cells,
+    }
+
+
+def test_memory_over_a_million_samples(predictor, figures):
+    resident = []
+    for part in range(10):
+        for sample in stream(MILLION // 10, 2e3 + 200.0 * part):
+            predictor.update(sample)
+        resident.append(resident_megabytes())
+    figures["online_memory"] = {
+        "samples": float(MILLION),
+        "resident_megabytes_after_a_tenth": resident[0],
+        "resident_megabytes_at_the_end": resident[-1],
+        "peak_megabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+        "cells": predictor.cells,
+    }
+
+
+def resident_megabytes() -> float:
+    with open("/proc/self/statm", encoding="ascii") as file:
+        return int(file.read().split()[1]) * resource.getpagesize() / 2**20
