@@ -7,13 +7,15 @@ import json
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any, TypeVar
 
-from benchmarks.results import ROOT, Results
+from benchmarks.results import ROOT
 
 #: What figures depend on; where any of it has changed nothing finished counts.
 SOURCES = ("bayes_impedance/**/*.py", "configs/**/*.yaml", "benchmarks/*.py")
 
-Job = Callable[[], Results]
+
+T = TypeVar("T")
 
 
 class Ledger:
@@ -22,13 +24,13 @@ class Ledger:
     def __init__(self, name: str, folder: Path | None = None, digest: str | None = None) -> None:
         self.path = (folder or Path(tempfile.gettempdir())) / f"bayes_impedance-{name}.json"
         self._digest = digest or _digest()
-        self._finished: dict[str, Results] = {}
+        self._finished: dict[str, Any] = {}
         if self.path.is_file():
             record = json.loads(self.path.read_text(encoding="utf-8"))
             self._finished = record["finished"] if record["digest"] == self._digest else {}
 
-    def run(self, name: str, job: Job) -> Results:
-        """Figures of a job, computed unless they are known."""
+    def run(self, name: str, job: Callable[[], T]) -> T:
+        """Plain figures of a job, computed unless they are known."""
         if name not in self._finished:
             self._finished[name] = job()
             written = self.path.with_suffix(".new")
@@ -36,7 +38,8 @@ class Ledger:
             written.write_text(json.dumps(record), encoding="utf-8")
             written.replace(self.path)
             print(name, flush=True)
-        return self._finished[name]
+        figures: T = self._finished[name]
+        return figures
 
     def close(self) -> None:
         """All is done: forget it."""

@@ -8,7 +8,7 @@ learned; the residual takes the hyperparameters of the naive GP. What cannot be 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -94,11 +94,7 @@ class Reuse:
 
     def scores(self, log: PreparedLog, target: PreparedLog, test: PreparedLog) -> Results:
         """Axis → model → scores on the forces of `test` given those of `log`."""
-        predictions = predict(self.predictors(log), log, target, test)
-        return {
-            axis: {name: scores.as_dict() for name, scores in models.items()}
-            for axis, models in scored([predictions]).items()
-        }
+        return scores_of(self.predictors(log), log, target, test)
 
     def hyperparameters(self) -> Results:
         """What the naive GP found, by axis."""
@@ -106,3 +102,13 @@ class Reuse:
             entry.name: entry.value.detach().reshape(entry.value.shape[0], -1).tolist()
             for entry in self.naive.hyperparameters
         }
+
+
+def scores_of(
+    predictors: Mapping[str, Predictor], training: PreparedLog, target: PreparedLog, test: PreparedLog
+) -> Results:
+    """Axis → model → scores on the forces of `test`, whose samples are those of `target`."""
+    return {
+        axis: {name: scores.as_dict() for name, scores in models.items()}
+        for axis, models in scored([predict(predictors, training, target, test)]).items()
+    }

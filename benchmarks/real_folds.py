@@ -1,8 +1,8 @@
 """Real recordings in the paper's setting: each run predicted from the others of its task, or its end from its start.
 
-Every fold twice: `reused` as in `benchmarks.paper_protocol`, the naive GP being trained on the training runs; and
-`learned`, in which both models learn all their hyperparameters from the same forces, with the same hyperpriors on those
-that they share, and the same restarts.
+Every fold is predicted by the models of `benchmarks.paper_protocol`, whose naive GP is trained on the runs that are not
+held out, and by impedance models that learn all their hyperparameters from the same forces. Hyperpriors of what they
+share with the naive GP (residual and noise) and restarts are the same for all.
 """
 
 from __future__ import annotations
@@ -13,23 +13,29 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayes_impedance import ImpedanceModel, read_log
-from bayes_impedance.config import Config
-from bayes_impedance.evaluation.contenders import baseline_contenders, train_impedance
-from bayes_impedance.evaluation.folds import Folds, split
-from bayes_impedance.evaluation.held_out import predict, scored
+from bayes_impedance.config import Config, override_config
+from bayes_impedance.evaluation.contenders import train_impedance
+from bayes_impedance.evaluation.folds import Fold, Folds, split
 from bayes_impedance.preprocessing import PreparedLog
-from benchmarks.paper_protocol import IMPEDANCE, KNOWN, NAIVE, Reuse, settings
+from benchmarks.paper_protocol import KNOWN, NAIVE, Reuse, scores_of, settings
 from benchmarks.results import RECORDINGS, Results
 
-RESTARTS = 3
+RESTARTS = 1
+
+#: Models that learn impedance, too, and how they differ from the paper's setting.
+LEARNED: Mapping[str, Sequence[str]] = {
+    "learned_impedance": (),
+    "learned_impedance_with_acceleration": ("model.drop_acceleration=false",),
+}
 
 
 @dataclass(frozen=True)
 class Task:
-    """Runs of one task, the shipped configuration that reads them, and what is held out."""
+    """Runs of one task, the shipped configuration that reads them, samples a second, and what is held out."""
 
     source: str
     files: tuple[str, ...]
+    rate: float = 10.0
     folds: Folds = "trials"
 
     @property
@@ -44,54 +50,60 @@ class Task:
         )
 
 
-def _bags(folder: str, runs: Sequence[str], folds: Folds = "trials") -> Task:
-    return Task("recordings/gp_mpc", tuple(f"gp_mpc/{folder}/{run}.bag" for run in runs), folds)
+def _bags(folder: str, runs: Sequence[str]) -> tuple[str, ...]:
+    return tuple(f"gp_mpc/{folder}/{run}.bag" for run in runs)
 
 
 #: The twelve folds.
 TWELVE: Mapping[str, Task] = {
-    "acc_rail": _bags("acc_rail", ("1", "2", "3")),
-    **{f"acc_twobag_{t}": _bags("acc_twobag", [f"{t}{run}" for run in (1, 2, 3)]) for t in ("l", "r", "rr")},
+    "acc_rail": Task("recordings/gp_mpc", _bags("acc_rail", ("1", "2", "3"))),
+    "acc_twobag_l": Task("recordings/gp_mpc", _bags("acc_twobag", ("l1", "l2", "l3"))),
+    "acc_twobag_r": Task("recordings/gp_mpc", _bags("acc_twobag", ("r1", "r2", "r3"))),
+    "acc_twobag_rr": Task("recordings/gp_mpc", _bags("acc_twobag", ("rr1", "rr2", "rr3"))),
 }
+#: Runs on the rail last thrice as long.
 TASKS: Mapping[str, Task] = {
     **TWELVE,
     "panda": Task("recordings/panda_comanipulation", ("panda_comanipulation/symbol_17_data.mat",)),
-    "rail": _bags("rail", ("1", "2", "3"), "last-third"),
+    "rail": Task("recordings/gp_mpc", _bags("rail", ("1", "2", "3")), 5.0, "last-third"),
 }
 
 
-def configuration(name: str, protocol: str, restarts: int = RESTARTS) -> Config:
-    """Of a task under the protocol `reused` or `learned`."""
-    known = KNOWN if protocol == "reused" else ()
-    return settings(TASKS[name].source, [*known, f"training.restarts={restarts}"])
+def configuration(task: Task, overrides: Sequence[str] = (), restarts: int = RESTARTS) -> Config:
+    """The paper's θ and ξ for a task, at its rate."""
+    config = settings(task.source, [*overrides, f"training.restarts={restarts}"])
+    return override_config(config, [f"preprocessing.rate={task.rate}"])
 
 
-def folds_of(name: str, protocol: str, restarts: int = RESTARTS, only: int | None = None) -> Results:
-    """Scores of every fold of a task, or of one of them, by axis and model."""
-    task, config = TASKS[name], configuration(name, protocol, restarts)
+def _folds(task: Task, config: Config) -> tuple[Fold, ...]:
+    return split(task.prepared(config), config, task.folds)
+
+
+def held_out(name: str) -> list[Results]:
+    """What each fold of a task holds out, and how many samples train."""
+    folds = _folds(TASKS[name], configuration(TASKS[name]))
+    return [{"held_out": list(fold.held_out), "samples": fold.training.n_samples} for fold in folds]
+
+
+def reused(name: str, restarts: int = RESTARTS, only: int | None = None) -> list[Results]:
+    """By fold: axis → model → scores, where the impedance model takes over what the naive GP has learned."""
+    config = configuration(TASKS[name], KNOWN, restarts)
     found = []
-    for index, fold in enumerate(split(task.prepared(config), config, task.folds)):
-        if only not in (None, index):
-            continue
-        figures: Results = {"held_out": list(fold.held_out), "samples": fold.training.n_samples}
-        if protocol == "reused":
+    for index, fold in enumerate(_folds(TASKS[name], config)):
+        if only in (None, index):
             reuse = Reuse.trained(config, fold.training)
-            figures["axes"] = reuse.scores(fold.training, fold.target, fold.test)
-            figures["naive"] = reuse.hyperparameters()
-        else:
-            figures["axes"] = _learned(config, fold.training, fold.target, fold.test)
-        found.append(figures)
-    return {"folds": found}
+            found.append(reuse.scores(fold.training, fold.target, fold.test))
+    return found
 
 
-def _learned(config: Config, training: PreparedLog, target: PreparedLog, test: PreparedLog) -> Results:
-    predictors = {IMPEDANCE: train_impedance(config, training, None)}
-    for contender in baseline_contenders(config, ["naive"]):
-        predictors[contender.name] = contender.train(training)
-    predictions = predict(predictors, training, target, test)
-    return {
-        axis: {n: s.as_dict() for n, s in models.items()} for axis, models in scored([predictions]).items()
-    }
+def learned(name: str, model: str) -> list[Results]:
+    """By fold: axis → scores of one of the models that learn all their hyperparameters."""
+    config = configuration(TASKS[name], LEARNED[model])
+    found = []
+    for fold in _folds(TASKS[name], config):
+        predictors = {model: train_impedance(config, fold.training, None)}
+        found.append(scores_of(predictors, fold.training, fold.target, fold.test))
+    return found
 
 
 def compared(folds: Sequence[Results]) -> Results:
