@@ -14,6 +14,9 @@ from benchmarks.closed_loop_results import SEEDS, WAYS, estimate
 from benchmarks.core_results import configuration_of, coverage_of, demo, known_equilibrium
 from benchmarks.coupled_results import SEEDS as COUPLED_SEEDS
 from benchmarks.coupled_results import identified
+from benchmarks.human_experiment_results import AMOUNTS
+from benchmarks.human_experiment_results import subject as unseen_repetitions
+from benchmarks.ledger import Ledger
 from benchmarks.planning_results import ARMS, CHECKED_PERTURBATIONS, PERTURBATIONS, planned, widths
 from benchmarks.reading_results import BAGS, RECORDINGS, bag
 from benchmarks.recordings_results import last_third
@@ -241,6 +244,51 @@ def test_recordings(shared_data: Path) -> None:
     for name, scores in figures["axes"]["z"].items():
         assert now["axes"]["z"][name]["nlpd"] == pytest.approx(scores["nlpd"], abs=0.02)
     assert now["impedance_share"]["z"] == pytest.approx(figures["impedance_share"]["z"], abs=1e-3)
+
+
+def test_human_experiment() -> None:
+    """One subject again; knowing of arms helps with the repetitions that nobody has seen, little as they add."""
+    figures = committed("human_experiment")["figures"]["subjects"]
+    now = unseen_repetitions("C", "unperturbed")
+    then = figures["unperturbed"]["C"]
+    assert now["samples"] == then["samples"]
+    for axis, models in then["unseen"]["axes"].items():
+        for model, scores in models.items():
+            assert now["unseen"]["axes"][axis][model]["msll"] == pytest.approx(scores["msll"], abs=0.02)
+    assert set(figures["unperturbed"]) == {"A", "B", "C"}
+    for found in figures["unperturbed"].values():
+        assert sum(found["samples"]) <= 1500
+        assert set(found["last_two_over_amount"]) == {str(amount) for amount in AMOUNTS}
+        for scores in found["unseen"]["axes"].values():
+            for metric in ("msll", "smse"):
+                assert scores["impedance"][metric] < scores["naive"][metric]
+                assert scores["impedance_with_acceleration"][metric] < scores["impedance"][metric]
+            assert scores["naive"]["msll"] < scores["impedance_without_residual"]["msll"]
+
+
+def test_human_experiment_on_real_runs() -> None:
+    """Twelve folds, all axes: better on average; in most of them only where the chain rule is complete."""
+    figures = committed("human_experiment")["figures"]["recordings"]
+    for protocol in ("reused", "learned"):
+        assert all(
+            fold["samples"] <= 1500 for task in figures[protocol]["tasks"].values() for fold in task["folds"]
+        )
+        summary = figures[protocol]["twelve_folds"]
+        assert summary["folds"] == 12
+        assert summary["impedance"]["axes_of"] == 36
+        assert summary["impedance"]["msll"] < summary["naive"]["msll"]
+    complete = figures["reused"]["twelve_folds"]["impedance_with_acceleration"]
+    assert complete["msll"] < figures["reused"]["twelve_folds"]["impedance"]["msll"]
+    assert complete["axes_won"] > 27
+
+
+def test_ledger_goes_on_behind_the_last_job(tmp_path: Path) -> None:
+    Ledger("some", tmp_path, "code").run("first", lambda: {"figure": 1})
+    again = Ledger("some", tmp_path, "code")
+    assert again.run("first", lambda: {"figure": 2}) == {"figure": 1}
+    assert Ledger("some", tmp_path, "other code").run("first", lambda: {"figure": 3}) == {"figure": 3}
+    again.close()
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ["rail/1", "loader_edge_cases/polish_flat2_2_only31msgs"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 from bayes_impedance.config import Config, DesiredTrajectoryPrior, ResidualPrior
 from bayes_impedance.errors import LogError
 from bayes_impedance.features import FeatureMap, baseline_components, label_trials
@@ -38,6 +40,12 @@ class NaiveModel:
     def hyperparameters(self) -> tuple[Entry, ...]:
         """Hyperparameters with unit, hyperprior and value `(axes, 1, 1, components)`."""
         return self._model.entries
+
+    def given(self, log: PreparedLog) -> NaiveModel:
+        """The same hyperparameters, given the forces of `log` in the place of those that trained them."""
+        other = copy.copy(self)
+        other._log = log
+        return other
 
     def predict(self, log: PreparedLog) -> Posterior:
         """Force of `log` given the training forces; only the marginal of `Latent.FORCE`."""

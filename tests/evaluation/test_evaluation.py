@@ -49,6 +49,10 @@ def force(log: PreparedLog, axis: int) -> np.ndarray:
     return np.concatenate([trial.force[:, axis] for trial in log.trials])
 
 
+def force_of(log: PreparedLog) -> np.ndarray:
+    return np.concatenate([trial.force for trial in log.trials])
+
+
 def test_naive_gp_predicts_what_gpytorch_predicts(tiny, other):
     training = tiny.fitted.fitted.log
     model = NaiveModel(tiny.config, training)
@@ -102,6 +106,22 @@ def test_naive_gp_trains(tiny):
     start = load_config("phase", ["training.max_iterations=1"]).training
     less = NaiveModel(tiny.config.model_copy(update={"training": start}), tiny.fitted.fitted.log).report
     assert np.sum(report.objective) > np.sum(less.objective)
+
+
+def test_naive_gp_given_other_forces(tiny, other):
+    """Hyperparameters stay, forces change, and what was trained is left as it was."""
+    training = tiny.fitted.fitted.log
+    model = NaiveModel(tiny.config, training)
+    before = model.predict(other)["force"]
+    informed = model.given(other)
+    assert informed.hyperparameters == model.hyperparameters
+    assert informed.report == model.report
+    error, less = (
+        np.abs(predicted.mean - force_of(other)) for predicted in (before, informed.predict(other)["force"])
+    )
+    assert less.mean() < error.mean()
+    np.testing.assert_array_equal(model.predict(other)["force"].mean, before.mean)
+    np.testing.assert_array_equal(model.given(training).predict(other)["force"].sd, before.sd)
 
 
 def test_scores_are_pooled_over_trials(tiny, tmp_path):
