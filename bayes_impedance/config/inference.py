@@ -22,7 +22,7 @@ class LocalConfig(Section):
     """Local sparse models on a grid of cells, for streams and long logs.
 
     Each sample belongs to the `active` nearest cells. A cell keeps at most `inducing` inputs, and a sample becomes one
-    of them where it has a share above `novelty` of its prior variance for itself. `width` of a cell by component, in
+    of them where what the others leave of its force exceeds `novelty` times the noise variance. `width` of a cell by component, in
     the component's unit: those of θ, each a length scale of the desired trajectory wide, if null. The grid reaches one
     cell beyond the motion that the model was trained on, with at most `cells` of them in use. `forgetting`: samples of
     a cell after which one weighs 1/e; null keeps all.
@@ -30,7 +30,7 @@ class LocalConfig(Section):
 
     inducing: int = Field(default=50, ge=2, le=2000)
     active: int = Field(default=3, ge=1, le=9)
-    novelty: float = Field(default=1e-3, ge=0, lt=1)
+    novelty: float = Field(default=0.03, ge=0)
     width: dict[Component, Annotated[float, Field(gt=0)]] | None = None
     cells: int = Field(default=1000, ge=1)
     forgetting: float | None = Field(default=None, gt=0)

@@ -101,8 +101,8 @@ def learn(
     Inputs `x` `(axes, D)`, prior variance of their force `own` `(axes,)` [N²], u − E[u] `residual` `(axes,)` [N].
 
     What readers of the old cell see stays: new arrays come back, and `inputs` and `prior` gain rows that only the new
-    count reaches. `noise` σ_r² `(axes,)` [N²]. An input becomes an inducing one where it has a share above `novelty` of
-    its prior variance for itself and there is room.
+    count reaches. `noise` σ_r² `(axes,)` [N²]. An input becomes an inducing one where the others
+    leave more than `novelty` times the noise of its variance, and there is room.
     """
     axes, most = cell.d.shape
     count = cell.count.copy()
@@ -113,7 +113,7 @@ def learn(
         covariances(numbers, axis, cell.inputs[axis, :, :n], x[axis], a[:, :n])
         solve(cell.prior[axis], n, a[0])
         left = max(own[axis] - squared_norm(a[0], n), 0.0)
-        if n < most and left > max(novelty, LEAST_NOVELTY) * own[axis]:
+        if n < most and left > max(novelty * noise[axis], LEAST_NOVELTY * own[axis]):
             cell.inputs[axis, :, n] = x[axis]
             cell.prior[axis, n, :n] = a[0, :n]
             cell.prior[axis, n, n] = np.sqrt(left)
@@ -174,11 +174,11 @@ def moments(
 
 
 @njit(cache=True, nogil=True)
-def choose(numbers: KernelNumbers, axis: int, inputs: Floats, most: int, novelty: float) -> Integers:
+def choose(numbers: KernelNumbers, axis: int, inputs: Floats, most: int, enough: float) -> Integers:
     """Rows of `inputs` `(n, D)` to be inducing inputs: each is the one that those before explain least.
 
-    That is a Cholesky factorisation with pivoting; it ends where no row has a share above `novelty` of its prior
-    variance for itself.
+    That is a Cholesky factorisation with pivoting; it ends where they leave no row a variance above `enough`
+    [N²].
     """
     n = inputs.shape[0]
     most = min(most, n)
@@ -193,7 +193,7 @@ def choose(numbers: KernelNumbers, axis: int, inputs: Floats, most: int, novelty
     row = np.empty((1, n))
     for m in range(most):
         best = int(np.argmax(left))
-        if left[best] <= max(novelty, LEAST_NOVELTY) * whole[best]:
+        if left[best] <= max(enough, LEAST_NOVELTY * whole[best]):
             return chosen[:m]
         chosen[m] = best
         covariances(numbers, axis, columns, inputs[best], row)

@@ -160,7 +160,8 @@ class LocalModel:
         candidates = np.unique(np.linspace(0, n - 1, min(n, CANDIDATES)).astype(int))
         for axis in range(self.noise.size):
             among = inputs[axis, candidates]
-            chosen = choose(self.numbers, axis, among, self.settings.inducing, self.settings.novelty)
+            enough = self.settings.novelty * self.noise[axis]
+            chosen = choose(self.numbers, axis, among, self.settings.inducing, enough)
             place(self.numbers, axis, cell, among[chosen])
             for start in range(0, n, BLOCK):
                 block = slice(start, start + BLOCK)
