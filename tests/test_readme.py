@@ -36,14 +36,24 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_python_example_runs_and_prints_a_verdict(place: Path) -> None:
-    (code,) = blocks("python")
-    assert len([line for line in code.splitlines() if line]) == 5
+def run(code: str, place: Path) -> str:
+    """What a block of Python prints."""
     result = subprocess.run(
         [sys.executable, "-c", code], cwd=place, capture_output=True, text=True, check=False
     )
     assert result.returncode == 0, result.stderr
-    assert "stiffness xx:" in result.stdout
+    return result.stdout
+
+
+def test_python_example_runs_and_prints_a_verdict(place: Path) -> None:
+    code, _ = blocks("python")
+    assert len([line for line in code.splitlines() if line]) == 5
+    assert "stiffness xx:" in run(code, place)
+
+
+def test_control_loop_predicts_where_the_arm_has_been(place: Path) -> None:
+    _, code = blocks("python")
+    assert run(code, place).split()[-1] == "LEARNED"
 
 
 def test_commands_run_in_the_order_shown(place: Path) -> None:
