@@ -283,7 +283,8 @@ def infer(
     check_writable(out)
     trained = load_model(model)
     log = read_log(logs, trained.config.log, require_force=given is Given.log)
-    posterior = trained.posterior(log, given.value)
+    with terminal.inference_progress(console) as progress:
+        posterior = trained.posterior(log, given.value, progress=progress)
     if figures is not None:
         prepare_folder(figures)
     write_table(posterior.table(), out)

@@ -81,6 +81,7 @@ class ImpedanceModel:
     def __init__(self, config: Config, fit: Fit | None = None) -> None:
         self.config = config
         self._fit = fit
+        self._trained_mean: TrajectoryMean | None = None
 
     @classmethod
     def from_config(cls, source: str | Path | Config, overrides: Iterable[str] = ()) -> ImpedanceModel:
@@ -387,8 +388,12 @@ class ImpedanceModel:
 
     def _mean(self, log: PreparedLog) -> TrajectoryMean:
         """Prior mean of x_d, learned from the training log where there is one, else from `log` itself."""
-        source = log if self._fit is None else self._fit.log
-        return TrajectoryMean.from_training(self.config.model.desired_trajectory, source)
+        prior = self.config.model.desired_trajectory
+        if self._fit is None:
+            return TrajectoryMean.from_training(prior, log)
+        if self._trained_mean is None:
+            self._trained_mean = TrajectoryMean.from_training(prior, self._fit.log)
+        return self._trained_mean
 
     def _evidence(self, log: PreparedLog, given: Given) -> PreparedLog | None:
         """Trials whose forces are conditioned on: of the groups of `log`, each motion once."""

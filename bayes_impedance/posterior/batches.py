@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from threading import Event, Lock
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -24,9 +23,10 @@ from bayes_impedance.preprocessing import PreparedLog
 PADDING = 1.25
 #: A batch has at most so many pieces of targets, or as many as its forces are worth: a long log is many batches.
 PIECES = 16
+#: Rows of a covariance from which on the factor gains from several threads; calls on smaller ones wait for each other.
+LARGE = 1000
 
 Samples = NDArray[np.int64]
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,14 @@ class Batch:
     """Groups that are inferred together.
 
     `given`, `target`: trials of the log of forces and of that of targets, by index, group after group in one order.
-    `pieces`: samples of each target trial that are taken together, one piece after another.
+    `pieces`: samples of each target trial that are taken together, one piece after another. `size`: rows of the largest
+    covariance.
     """
 
     given: tuple[int, ...]
     target: tuple[int, ...]
     pieces: tuple[tuple[Samples, ...], ...]
+    size: int
 
 
 @dataclass(frozen=True)
@@ -67,29 +69,30 @@ def plan(log: PreparedLog, given: PreparedLog | None, coupled: bool) -> list[Bat
         most = max(PIECES, -(-4 * forces // step)) * step
         for start in range(0, targets, most):
             stop = min(start + most, targets)
-            batch = _batch(log, groups, range(start, stop, step), step)
+            size = forces * axes if coupled else forces
+            batch = _batch(log, groups, range(start, stop, step), step, size)
             batches.append((len(groups) * _work(forces, stop - start), batch))
     batches.sort(key=lambda pair: -pair[0])
     return [batch for _, batch in batches]
 
 
 def for_each(
-    work: Callable[[T], Iterator[int]],
-    items: Sequence[T],
+    work: Callable[[Batch], Iterator[int]],
+    batches: Sequence[Batch],
     total: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """`work` on every item, on as many threads as torch has; `progress` hears of each count that it yields.
+    """`work` on every batch, on as many threads as torch has; `progress` hears of each count that it yields.
 
-    A single item, or a single thread, is left to torch's own threads. An exception, Ctrl-C included, ends them all.
+    Each batch has one thread, but one that is alone and large has all. An exception, Ctrl-C included, ends them all.
     """
-    workers = min(torch.get_num_threads(), len(items))
+    workers = min(torch.get_num_threads(), len(batches))
     stopped, lock = Event(), Lock()
     done = 0
 
-    def follow(item: T) -> None:
+    def follow(batch: Batch) -> None:
         nonlocal done
-        for count in work(item):
+        for count in work(batch):
             with lock:
                 done += count
                 if progress is not None:
@@ -97,19 +100,23 @@ def for_each(
             if stopped.is_set():
                 return
 
-    if workers < 2:
-        for item in items:
-            follow(item)
+    if len(batches) == 1 and batches[0].size >= LARGE:
+        follow(batches[0])
         return
-    # Threads take over the number of threads that torch has when they begin.
-    with one_thread(), ThreadPoolExecutor(workers) as pool:
-        try:
-            for future in as_completed([pool.submit(follow, item) for item in items]):
-                future.result()
-        except BaseException:
-            stopped.set()
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    # Threads of a pool take over the number of threads that torch has when they begin.
+    with one_thread():
+        if workers == 1:
+            for batch in batches:
+                follow(batch)
+            return
+        with ThreadPoolExecutor(workers) as pool:
+            try:
+                for future in as_completed([pool.submit(follow, batch) for batch in batches]):
+                    future.result()
+            except BaseException:
+                stopped.set()
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
 
 
 def _groups(log: PreparedLog, given: PreparedLog | None) -> list[_Group]:
@@ -150,11 +157,11 @@ def _alike(groups: Sequence[_Group], width: int) -> Iterator[list[_Group]]:
         yield batch
 
 
-def _batch(log: PreparedLog, groups: Sequence[_Group], starts: range, step: int) -> Batch:
+def _batch(log: PreparedLog, groups: Sequence[_Group], starts: range, step: int, size: int) -> Batch:
     cuts = [_pieces([log.trials[i].n_samples for i in group.target], starts, step) for group in groups]
     pieces = tuple(tuple(samples for one in piece for samples in one) for piece in zip(*cuts, strict=True))
     given = tuple(i for group in groups for i in group.given)
-    return Batch(given, tuple(i for group in groups for i in group.target), pieces)
+    return Batch(given, tuple(i for group in groups for i in group.target), pieces, size)
 
 
 def _pieces(lengths: Sequence[int], starts: range, step: int) -> list[list[Samples]]:

@@ -71,9 +71,9 @@ def infer_log(
 ) -> Posterior:
     """Posteriors at every sample of the log of `target`, given all forces of that of `given`.
 
-    As `compute_posterior`, but in batches of groups of similar length, on as many threads as torch has. Memory beyond
-    logs and results is bounded by what the largest group needs, or the largest batch; numbers do not depend on threads
-    but, where there is a single batch, in their rounding.
+    As `compute_posterior`, but in batches of groups of similar length, on as many threads as torch has. Numbers do not
+    depend on threads (but for the rounding of a single large group). Memory beyond logs and results is that of the
+    batches at work, whatever their number and the length of the log: see `conditioning.ENTRIES`.
 
     Raises:
         NotPositiveDefiniteError: the covariance of the given forces does not factorise.
