@@ -42,7 +42,7 @@ from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.outputs import check_replaceable, check_writable, prepare_folder, write_json
 from bayes_impedance.persistence import METADATA, load_model, save_model
 from bayes_impedance.plotting import plot_force, save_figure, save_figures
-from bayes_impedance.posterior.compute import UNITS
+from bayes_impedance.posterior.results import UNITS
 from bayes_impedance.readers import read_log
 from bayes_impedance.sensitivity import Sensitivity, prior_sensitivity
 from bayes_impedance.writer import check_table_name, write_table
@@ -283,7 +283,8 @@ def infer(
     check_writable(out)
     trained = load_model(model)
     log = read_log(logs, trained.config.log, require_force=given is Given.log)
-    posterior = trained.posterior(log, given.value)
+    with terminal.inference_progress(console) as progress:
+        posterior = trained.posterior(log, given.value, progress=progress)
     if figures is not None:
         prepare_folder(figures)
     write_table(posterior.table(), out)

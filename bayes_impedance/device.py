@@ -39,8 +39,8 @@ class Loop:
             ConfigurationError: an axis of the log has no virtual mass.
         """
         steps = []
-        for group in log.groups:
-            times = [trial.time for trial in log.trials if trial.group == group]
+        for members in log.by_group.values():
+            times = [log.trials[i].time for i in members]
             steps.append(sum(np.ptp(time) for time in times) / max(1, sum(len(time) - 1 for time in times)))
         mass = torch.from_numpy(device.masses(log.axes)).unsqueeze(-1)
         damping = device.dampings(log.axes)

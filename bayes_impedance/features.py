@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -116,27 +116,29 @@ class FeatureMap:
         self,
         log: PreparedLog,
         mean: TrajectoryMean,
-        trial_labels: Mapping[str, int] | None = None,
+        trial_labels: Mapping[str, int] | Sequence[int] | None = None,
         *,
         observed: bool = False,
         samples: Sequence[NDArray[np.int64]] | None = None,
     ) -> Features:
         """Inputs of the samples of `log`; trials with equal label share what trials do not share otherwise.
 
-        `trial_labels` maps `trial_key` to a label, so that two logs can be put into one covariance; `observed` leaves
-        out samples without known force, which cannot be conditioned on. `samples`: those of each trial that are asked
-        for, all if None.
+        `trial_labels` maps `trial_key` to a label, so that two logs can be put into one covariance, or lists that of
+        each trial; `observed` leaves out samples without known force, which cannot be conditioned on. `samples`: those
+        of each trial that are asked for, all if None.
 
         Raises:
             ConfigurationError: noise of the positions is to be carried, and the motion did not pass the smoother.
         """
-        labels = trial_labels or label_trials(log)
-        blocks = [self._trial(trial, mean, labels[trial_key(trial)]) for trial in log.trials]
-        groups = log.groups
-        members = [[i for i, trial in enumerate(log.trials) if trial.group == group] for group in groups]
+        labels = label_trials(log) if trial_labels is None else trial_labels
+        if isinstance(labels, Mapping):
+            labels = labels_of(log, labels)
         chosen = samples or [
             np.flatnonzero(trial.observed) if observed else np.arange(trial.n_samples) for trial in log.trials
         ]
+        blocks = [self._trial(*one, mean) for one in zip(log.trials, chosen, labels, strict=True)]
+        by_group = log.by_group
+        groups, members = tuple(by_group), list(by_group.values())
         lengths = [sum(len(chosen[i]) for i in member) for member in members]
         n, a = max(lengths), len(self.axes)
         has_force = all(trial.force is not None for trial in log.trials)
@@ -146,8 +148,8 @@ class FeatureMap:
         valid = np.zeros((len(groups), n), dtype=bool)
         rows = []
         for g, (member, length) in enumerate(zip(members, lengths, strict=True)):
-            inputs[:, g, :length] = np.concatenate([blocks[i][0][:, chosen[i]] for i in member], axis=1)
-            means[:, g, :length] = np.concatenate([blocks[i][1][:, chosen[i]] for i in member], axis=1)
+            inputs[:, g, :length] = np.concatenate([blocks[i][0] for i in member], axis=1)
+            means[:, g, :length] = np.concatenate([blocks[i][1] for i in member], axis=1)
             if has_force:
                 known = [values[chosen[i]] for i in member if (values := log.trials[i].force) is not None]
                 force[:, g, :length] = np.concatenate(known).T
@@ -163,10 +165,15 @@ class FeatureMap:
             loop=None if self.device is None else Loop.of(log, self.device),
         )
 
-    def _trial(self, trial: PreparedTrial, mean: TrajectoryMean, label: int) -> tuple[Array, Array]:
+    def _trial(
+        self, trial: PreparedTrial, rows: NDArray[np.int64], label: int, mean: TrajectoryMean
+    ) -> tuple[Array, Array]:
+        start = float(trial.time[0]) if trial.n_samples else 0.0
+        if len(rows) < trial.n_samples:
+            trial = trial.part(rows)
         n, a = len(trial.time), len(self.axes)
         values = np.zeros((a, n, self.width))
-        theta = [self._values(trial, component) for component in self.theta]
+        theta = [self._values(trial, component, start) for component in self.theta]
         values[..., list(self._columns["theta"])] = np.concatenate([part[0] for part in theta], axis=1)
         velocity = [part[1] for part in theta]
         if self.model.drop_acceleration:
@@ -176,7 +183,7 @@ class FeatureMap:
             second = np.concatenate([part[2] for part in theta], axis=1)
             values[..., list(self._columns["theta_acceleration"])] = second
         for component in self.xi:
-            values[..., list(self._columns[f"xi.{component}"])] = self._values(trial, component)[0]
+            values[..., list(self._columns[f"xi.{component}"])] = self._values(trial, component, start)[0]
         desired = mean.derivatives(trial)
         hand = np.stack([trial.position, trial.velocity, trial.acceleration])
         if self.layout.error:
@@ -188,11 +195,11 @@ class FeatureMap:
             values[..., list(self.layout.smoothing)] = np.column_stack([np.full(n, label), _smoothing(trial)])
         return values, np.moveaxis(desired, (0, 1, 2), (2, 1, 0))
 
-    def _values(self, trial: PreparedTrial, component: str) -> tuple[Array, Array, Array]:
-        """A component and its first two time derivatives, `(n, size)` each."""
+    def _values(self, trial: PreparedTrial, component: str, start: float) -> tuple[Array, Array, Array]:
+        """A component and its first two time derivatives, `(n, size)` each; time counts from `start` [s]."""
         if component == "time":
             one = np.ones((len(trial.time), 1))
-            return (trial.time - trial.time[0])[:, None], one, np.zeros_like(one)
+            return (trial.time - start)[:, None], one, np.zeros_like(one)
         if component == "phase":
             phase, rate, change = phase_derivatives(trial)
             return phase[:, None], rate[:, None], change[:, None]
@@ -202,6 +209,31 @@ class FeatureMap:
 
     def _size(self, component: str) -> int:
         return 1 if component in ("time", "phase") else len(self.axes)
+
+
+@dataclass(frozen=True)
+class LogFeatures:
+    """Features of any part of a log, formed when they are asked for; `labels` of its trials (see `FeatureMap`)."""
+
+    feature_map: FeatureMap
+    log: PreparedLog
+    mean: TrajectoryMean
+    labels: Sequence[int]
+
+    def __call__(
+        self,
+        trials: Sequence[int] | None = None,
+        *,
+        observed: bool = False,
+        samples: Sequence[NDArray[np.int64]] | None = None,
+    ) -> Features:
+        """Of the trials with these indices, all if None; `rows` of the features count these trials."""
+        log, labels = self.log, self.labels
+        if trials is not None:
+            # Of two logs, whose trials may share their names.
+            log = replace(log, trials=tuple(log.trials[i] for i in trials))
+            labels = [labels[i] for i in trials]
+        return self.feature_map(log, self.mean, labels, observed=observed, samples=samples)
 
 
 def _carries_motion_noise(model: ModelConfig) -> bool:
@@ -256,10 +288,8 @@ def check_combination(config: Config, log: PreparedLog) -> None:
             "model.axes=independent, or name more in log.axes"
         )
     if model.trajectory_input == "phase" and model.desired_trajectory.mean == "equilibrium":
-        for group in log.groups:
-            count = count_repetitions(
-                log.select([i for i, trial in enumerate(log.trials) if trial.group == group])
-            )
+        for group, members in log.by_group.items():
+            count = count_repetitions(log.select(members))
             if count > 1:
                 raise ConfigurationError(
                     "desired_trajectory.mean: expected trial_average, reference or constant with "
@@ -271,11 +301,11 @@ def check_combination(config: Config, log: PreparedLog) -> None:
 
 def count_repetitions(log: PreparedLog, others: Sequence[PreparedTrial] = ()) -> int:
     """Repetitions of the group of `log` that has fewest, `others` counted in, each motion once."""
-    distinct = {trial_key(trial): trial for trial in (*log.trials, *others)}.values()
-    return min(
-        sum(np.unique(trial.repetition).size for trial in distinct if trial.group == group)
-        for group in log.groups
-    )
+    counts = dict.fromkeys(log.groups, 0)
+    for trial in {trial_key(trial): trial for trial in (*log.trials, *others)}.values():
+        if trial.group in counts:
+            counts[trial.group] += np.unique(trial.repetition).size
+    return min(counts.values())
 
 
 def trial_key(trial: PreparedTrial) -> str:
@@ -292,6 +322,11 @@ def label_trials(*logs: PreparedLog) -> dict[str, int]:
         label = labels.setdefault(trial_key(trial), count)
         labels.setdefault(_key(trial, None), label)
     return labels
+
+
+def labels_of(log: PreparedLog, labels: Mapping[str, int]) -> list[int]:
+    """The label of each trial of `log`."""
+    return [labels[trial_key(trial)] for trial in log.trials]
 
 
 def _key(trial: PreparedTrial, force: Array | None) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from bayes_impedance.config import Config
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
 from bayes_impedance.posterior import Marginal, Posterior
-from bayes_impedance.posterior.compute import UNITS
+from bayes_impedance.posterior.results import UNITS
 from bayes_impedance.preprocessing import PreparedLog, PreparedTrial
 
 #: A posterior SD of half the prior's, and of √¾ of it.

@@ -112,6 +112,14 @@ class TrialSet(Generic[T]):
         return tuple(dict.fromkeys(trial.group for trial in self.trials))
 
     @property
+    def by_group(self) -> dict[str, list[int]]:
+        """Indices of the trials of each group, groups in order of appearance."""
+        members: dict[str, list[int]] = {}
+        for index, trial in enumerate(self.trials):
+            members.setdefault(trial.group, []).append(index)
+        return members
+
+    @property
     def n_samples(self) -> int:
         """Number of samples of all trials together."""
         return sum(trial.n_samples for trial in self.trials)

@@ -17,7 +17,15 @@ from bayes_impedance.engines.choice import LOCAL, MOMENTS, EngineChoice
 from bayes_impedance.engines.dense import Observations, check_capacity
 from bayes_impedance.engines.pointwise import PointPredictor
 from bayes_impedance.errors import ConfigurationError, LogError
-from bayes_impedance.features import FeatureMap, check_combination, count_repetitions, label_trials, trial_key
+from bayes_impedance.features import (
+    FeatureMap,
+    LogFeatures,
+    check_combination,
+    count_repetitions,
+    label_trials,
+    labels_of,
+    trial_key,
+)
 from bayes_impedance.identifiability import Verdict, assess, was_perturbed
 from bayes_impedance.impedance_functions.posterior import (
     compute_function_posterior,
@@ -28,8 +36,9 @@ from bayes_impedance.impedance_functions.train import FittedFunctions, train_fun
 from bayes_impedance.journal import Journal
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.log import InteractionLog
-from bayes_impedance.posterior import Posterior, compute_posterior
-from bayes_impedance.posterior.local import local_posterior
+from bayes_impedance.posterior import Posterior, infer_log
+from bayes_impedance.posterior.batches import Progress as InferenceProgress
+from bayes_impedance.posterior.local import infer_local
 from bayes_impedance.preprocessing import PreparedLog, prepare
 from bayes_impedance.priors import Entry, ForceModel, build_force_model
 from bayes_impedance.sampling.drawn import DrawnPosterior
@@ -73,6 +82,7 @@ class ImpedanceModel:
     def __init__(self, config: Config, fit: Fit | None = None) -> None:
         self.config = config
         self._fit = fit
+        self._trained_mean: TrajectoryMean | None = None
 
     @classmethod
     def from_config(cls, source: str | Path | Config, overrides: Iterable[str] = ()) -> ImpedanceModel:
@@ -186,11 +196,13 @@ class ImpedanceModel:
         log: InteractionLog | PreparedLog,
         given: Given = "both",
         latents: Sequence[Latent] | None = None,
+        progress: InferenceProgress | None = None,
     ) -> Posterior:
         """Posterior of every latent at every sample of `log`.
 
         `given`: the forces conditioned on: those of the training log ("training"), those of `log`
-        itself ("log"), or both, a trial that stands in both counting once.
+        itself ("log"), or both, a trial that stands in both counting once. `progress` hears how many samples are done,
+        of how many; not where impedance is a function, which is found for all groups together.
 
         Raises:
             LogError, ConfigurationError, TooManySamplesError, NotPositiveDefiniteError.
@@ -200,26 +212,25 @@ class ImpedanceModel:
         functions = self._functions if self._is_function else None
         feature_map = FeatureMap(self.config, prepared.axes)
         mean = self._mean(prepared)
-        conditions = None
         # One labelling for both, so that a trial that is target and evidence keeps its own x_d and ũ.
         labels = label_trials(*([prepared] if evidence is None else [prepared, evidence]))
+        target = LogFeatures(feature_map, prepared, mean, labels_of(prepared, labels))
+        given_forces = None
         if evidence is not None:
-            if functions is None and not self._is_local:
-                self._check_capacity(evidence)
-            conditions = feature_map(evidence, mean, labels, observed=True)
-        target = feature_map(prepared, mean, labels)
+            given_forces = LogFeatures(feature_map, evidence, mean, labels_of(evidence, labels))
         model = self._force_model(feature_map)
         if self._is_local:
-            return local_posterior(
-                model, feature_map, self.config.engine.local, prepared, target, conditions, latents
-            )
+            return infer_local(model, target, given_forces, self.config.engine.local, latents, progress)
         if functions is None:
-            return compute_posterior(model, prepared, target, conditions, self.config.engine.jitter, latents)
+            if evidence is not None:
+                self._check_capacity(evidence)
+            return infer_log(model, target, given_forces, self.config.engine.jitter, latents, progress)
         conditioned = None
-        if evidence is not None and conditions is not None:
-            conditioned = condition(self.config, model, functions, conditions, self._is_training(evidence))
+        if evidence is not None and given_forces is not None:
+            forces = given_forces(observed=True)
+            conditioned = condition(self.config, model, functions, forces, self._is_training(evidence))
         return compute_function_posterior(
-            self.config, model, functions, prepared, target, conditioned, latents
+            self.config, model, functions, prepared, target(), conditioned, latents
         )
 
     def sample(
@@ -391,8 +402,12 @@ class ImpedanceModel:
 
     def _mean(self, log: PreparedLog) -> TrajectoryMean:
         """Prior mean of x_d, learned from the training log where there is one, else from `log` itself."""
-        source = log if self._fit is None else self._fit.log
-        return TrajectoryMean.from_training(self.config.model.desired_trajectory, source)
+        prior = self.config.model.desired_trajectory
+        if self._fit is None:
+            return TrajectoryMean.from_training(prior, log)
+        if self._trained_mean is None:
+            self._trained_mean = TrajectoryMean.from_training(prior, self._fit.log)
+        return self._trained_mean
 
     def _evidence(self, log: PreparedLog, given: Given) -> PreparedLog | None:
         """Trials whose forces are conditioned on: of the groups of `log`, each motion once."""
@@ -413,8 +428,8 @@ class ImpedanceModel:
         # Coupled axes stand in one covariance.
         coupled = len(log.axes) if self.config.model.axes == "coupled" else 1
         counted = f", each counted once for every of {coupled} coupled axes" if coupled > 1 else ""
-        for group in log.groups:
-            n = sum(int(trial.observed.sum()) for trial in log.trials if trial.group == group)
+        for group, members in log.by_group.items():
+            n = sum(int(log.trials[i].observed.sum()) for i in members)
             check_capacity(coupled * n, self.config.engine.max_samples, f"group '{group}'{counted}")
 
 

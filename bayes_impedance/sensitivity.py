@@ -16,7 +16,7 @@ from bayes_impedance.identifiability import Support
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.posterior import Posterior
-from bayes_impedance.posterior.compute import UNITS, Array
+from bayes_impedance.posterior.results import UNITS, Array
 from bayes_impedance.priors import Entry
 
 #: Every prior is made this much wider, narrower, higher and lower: ± log 2.

@@ -18,6 +18,7 @@ from bayes_impedance.identifiability import OffDiagonal, Support, Verdict, cavea
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.posterior import Posterior
+from bayes_impedance.posterior.compute import Progress as InferenceHook
 from bayes_impedance.priors import Entry
 from bayes_impedance.sampling.drawn import DrawnPosterior
 from bayes_impedance.sampling.sample import Hook as SamplingHook
@@ -79,6 +80,21 @@ def sampling_progress(console: Console) -> Iterator[SamplingHook]:
             bar.update(tasks[what], completed=done, total=total or None, state=state)
 
         yield hook
+
+
+@contextmanager
+def inference_progress(console: Console) -> Iterator[InferenceHook]:
+    """A bar over samples; hidden where the output is no terminal."""
+    columns = (
+        TextColumn("inferring"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("samples"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 @contextmanager

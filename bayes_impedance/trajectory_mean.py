@@ -40,8 +40,8 @@ class TrajectoryMean:
         """
         averages: dict[str, BSpline] = {}
         constants: dict[str, Array] = {}
-        for group in log.groups:
-            trials = [trial for trial in log.trials if trial.group == group]
+        for group, members in log.by_group.items():
+            trials = [log.trials[i] for i in members]
             if prior.mean == "trial_average":
                 averages[group] = _average(trials, prior.average_knots)
             elif prior.mean == "constant":

@@ -19,7 +19,7 @@ from bayes_impedance.baselines import naive
 from bayes_impedance.config import dump_config, load_config
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.persistence import load_model, save_model
-from bayes_impedance.posterior.compute import UNITS
+from bayes_impedance.posterior.results import UNITS
 from bayes_impedance.readers import read_log
 
 COMMANDS = ("demo", "plan", "train", "infer", "evaluate", "show")

@@ -30,7 +30,7 @@ from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.persistence import load_model, save_model
 from bayes_impedance.posterior import Posterior, compute_posterior, draw_matrices, matrix_marginals
-from bayes_impedance.posterior.coupled import LogTerms
+from bayes_impedance.posterior.terms import LogTerms
 from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.priors import ForceModel, build_force_model
 from bayes_impedance.simulation.generative import as_recording, draw_force, repeated_motion

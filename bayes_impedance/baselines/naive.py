@@ -6,9 +6,15 @@ import copy
 
 from bayes_impedance.config import Config, DesiredTrajectoryPrior, ResidualPrior
 from bayes_impedance.errors import LogError
-from bayes_impedance.features import FeatureMap, baseline_components, label_trials
+from bayes_impedance.features import (
+    FeatureMap,
+    LogFeatures,
+    baseline_components,
+    label_trials,
+    labels_of,
+)
 from bayes_impedance.kernels.impedance import Latent
-from bayes_impedance.posterior import Posterior, compute_posterior
+from bayes_impedance.posterior import Posterior, infer_log
 from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.priors import Entry, ForceModel, build_naive_model
 from bayes_impedance.training import Progress, TrainingReport, train
@@ -50,14 +56,10 @@ class NaiveModel:
     def predict(self, log: PreparedLog) -> Posterior:
         """Force of `log` given the training forces; only the marginal of `Latent.FORCE`."""
         labels = label_trials(self._log, log)
-        return compute_posterior(
-            self._model,
-            log,
-            self._map(log, self._mean(log), labels),
-            self._map(self._log, self._mean(self._log), labels, observed=True),
-            self._config.engine.jitter,
-            [Latent.FORCE],
+        target, given = (
+            LogFeatures(self._map, one, self._mean(one), labels_of(one, labels)) for one in (log, self._log)
         )
+        return infer_log(self._model, target, given, self._config.engine.jitter, [Latent.FORCE])
 
     def _mean(self, log: PreparedLog) -> TrajectoryMean:
         return TrajectoryMean.from_training(self._config.model.desired_trajectory, log)

@@ -18,15 +18,14 @@ from bayes_impedance.impedance_functions.log_matrix import LogMatrix
 from bayes_impedance.impedance_functions.threads import one_thread
 from bayes_impedance.impedance_functions.train import FittedFunctions, build_density
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
-from bayes_impedance.posterior import Marginal, Posterior, by_sample, marginal_of
+from bayes_impedance.posterior import Marginal, Posterior
+from bayes_impedance.posterior.collected import Collected, axes_last
 from bayes_impedance.posterior.conditioning import Moments, select_groups
-from bayes_impedance.posterior.independent import prior_only
+from bayes_impedance.posterior.independent import IndependentPrior
 from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.priors import ForceModel
 
 Array = NDArray[np.float64]
-#: Location and covariance of the entries of a matrix logarithm, then those of their prior.
-LogMoments = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 @one_thread()
@@ -98,27 +97,23 @@ def compute_function_posterior(
     others = [latent for latent in wanted if latent not in IMPEDANCE_ORDER]
     orders = {latent: IMPEDANCE_ORDER[latent] for latent in wanted if latent in IMPEDANCE_ORDER}
     functions = build_functions(config, model, fitted.inducing)
-    parts: list[tuple[list[str], dict[Latent, Moments]]] = []
-    logarithms: list[tuple[list[str], dict[int, LogMoments]]] = []
+    collected = Collected(log)
     with torch.no_grad():
         if known:
             assert conditioned is not None
             own = select_groups(target, known)
-            parts.append((known, _known_others(model, conditioned, own, others)))
-            logarithms.append((known, {j: conditioned.logarithm(own, j) for j in orders.values()}))
+            collected.put(own, axes_last(_known_others(model, conditioned, own, others)))
+            collected.put(own, {latent: conditioned.logarithm(own, j) for latent, j in orders.items()})
         if unknown:
             own = select_groups(target, unknown)
-            parts.append((unknown, prior_only(model, own, others)))
+            collected.put(own, axes_last(IndependentPrior(model).moments(own, others)))
             x = own.inputs
-            before = {j: functions[j].prior(x, functions[j].design(x)) for j in orders.values()}
-            logarithms.append((unknown, before))
-    marginals = {latent: marginal_of(model, log, target, latent, parts) for latent in others}
+            before = {latent: functions[j].prior(x, functions[j].design(x)) for latent, j in orders.items()}
+            collected.put(own, before)
+    marginals = {latent: collected.marginal(latent, warped=False) for latent in others}
     couplings, laws = {}, {}
     for latent, j in orders.items():
-        listed = [
-            by_sample(log, target, [(chosen, found[j][i]) for chosen, found in logarithms]) for i in range(4)
-        ]
-        law = LogMatrix(functions[j].places, *listed)
+        law = LogMatrix(functions[j].places, *collected.take(latent))
         laws[latent] = law
         marginals[latent] = Marginal(latent, True, *law.diagonal(), *law.diagonal(prior=True))
         if law.is_coupled:
@@ -132,8 +127,9 @@ def _known_others(
     if not latents:
         return {}
     found = conditioned.others(target)
+    priors = IndependentPrior(model).moments(target, latents)
     result = {}
-    for latent, (_, _, prior_location, prior_variance) in prior_only(model, target, latents).items():
+    for latent, (_, _, prior_location, prior_variance) in priors.items():
         location, variance = found[latent]
         if latent is Latent.FORCE:
             variance = variance + model.noise_variance

@@ -205,17 +205,20 @@ class CoupledImpedanceKernel(Kernel):
             return None
         return [torch.stack([x[..., [columns[j]]] for columns in self.errors]) for j in range(3)]
 
-    def trajectory_covariance(self, x1: Tensor, x2: Tensor, order: int) -> Tensor:
+    def trajectory_covariance(
+        self, x1: Tensor, x2: Tensor, order: int, derivatives: Derivatives | None = None
+    ) -> Tensor:
         """Cov[u_a, x_d,c⁽ʳ⁾'] = Σ_i E[W_i,ac] D_ir,c, r = `order`, `(*batch, n1 · axes, n2 · axes)` [N m/sʳ]."""
-        derivatives = self.derivatives(x1, x2)
-        total = torch.zeros((), dtype=x1.dtype)
-        for i, process in enumerate(self.processes):
-            total = total + process.mean_matrices(x1) * derivatives[i][order]
+        derivatives = self.derivatives(x1, x2) if derivatives is None else derivatives
+        total = self.processes[0].mean_matrices(x1) * derivatives[0][order]
+        for i, process in enumerate(self.processes[1:], start=1):
+            total = multiply_add(total, process.mean_matrices(x1), derivatives[i][order])
         return _interleaved(total)
 
-    def trajectory_variance(self, x: Tensor, order: int) -> Tensor:
+    def trajectory_variance(self, x: Tensor, order: int, derivatives: Derivatives | None = None) -> Tensor:
         """Prior variance of x_d⁽ʳ⁾, r = `order`, `(*batch, n · axes)` [m²/s²ʳ]."""
-        return rows_of(self.derivatives(x, x, diag=True)[order][order])
+        derivatives = self.derivatives(x, x, diag=True) if derivatives is None else derivatives
+        return rows_of(derivatives[order][order])
 
     def loading(self, x: Tensor, order: int) -> Tensor:
         """∂E[u_a | g]/∂g_jr at the mean, a_ra (a_r·ē_j) E[e^{g_jr}], j = `order`, `(axes, terms, *batch, n, 1)` [N]."""
@@ -275,9 +278,8 @@ class CoupledInteractionKernel(LatentCovariances):
         """Forces of a sample: one an axis."""
         return self.impedance.axes
 
-    def forward(self, x1: Tensor, x2: Tensor, diag: bool = False, **params: object) -> Tensor:
-        """Cov[u, u'], `(*batch, n1 · axes, n2 · axes)`, or `(*batch, n · axes)` with `diag` [N²]."""
-        derivatives = self.impedance.derivatives(x1, x2, diag)
+    def covariance(self, x1: Tensor, x2: Tensor, derivatives: Derivatives, diag: bool = False) -> Tensor:
+        """Cov[u, u'] for `derivatives` of x_d alone, `(*batch, n1 · axes, n2 · axes)`, or `(*batch, n · axes)` [N²]."""
         if self.motion_noise is not None:
             variance = self.motion_noise.sd.square()
             smoothed = self.motion_noise.smoothed(x1, x2, diag)

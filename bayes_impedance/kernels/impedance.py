@@ -48,6 +48,10 @@ TRAJECTORY_ORDER = {
 IMPEDANCE_ORDER = {Latent.STIFFNESS: 0, Latent.DAMPING: 1, Latent.MASS: 2}
 
 
+#: A common factor, and ∂_tⁱ ∂_t'ʲ k_xd over it.
+Derivatives = tuple[Tensor, Table]
+
+
 @dataclass(frozen=True)
 class InputLayout:
     """Which columns of a kernel's input hold what; ξ of k, d and ũ is named by their own `active_dims`.
@@ -194,10 +198,22 @@ class ImpedanceKernel(BatchedKernel):
 
     def forward(self, x1: Tensor, x2: Tensor, diag: bool = False, **params: object) -> Tensor:
         """Cov[u, u'], `(..., n1, n2)`, or `(..., n)` with `diag` [N²]."""
+        derivatives = self.derivatives(x1, x2, diag, self.order)
+        return self.covariance(x1, x2, derivatives, diag)
+
+    def derivatives(self, x1: Tensor, x2: Tensor, diag: bool = False, order: int = 2) -> Derivatives:
+        """∂_tⁱ ∂_t'ʲ k_xd for i, j ≤ `order`; see `derivative_table`."""
         self._check_dtype(x1, x2)
+        path = self.layout.path
+        common, table = derivative_table(self.trajectory, path(x1), path(x2), order, diag)
+        shared = same_label(x1, x2, self.layout.trajectory, diag)
+        return common if shared is None else common * shared, table
+
+    def covariance(self, x1: Tensor, x2: Tensor, derivatives: Derivatives, diag: bool = False) -> Tensor:
+        """Cov[u, u'] for `derivatives` that are known already, `(..., n1, n2)`, or `(..., n)` with `diag` [N²]."""
+        common, table = self._of_force(derivatives)
         if diag:
-            return self._variance(x1)
-        common, table = self._trajectory_table(x1, x2)
+            return self._variance(x1, common, table)
         moments = [process.moments(x1, x2) for process in self.processes]
         return force_covariance(
             [e1 for e1, _, _ in moments],
@@ -209,9 +225,7 @@ class ImpedanceKernel(BatchedKernel):
             _transposed(self.layout.errors(x2, self.order)),
         )
 
-    def _variance(self, x: Tensor) -> Tensor:
-        path = self.layout.path(x)
-        common, table = derivative_table(self.trajectory, path, path, self.order, diag=True)
+    def _variance(self, x: Tensor, common: Tensor, table: Table) -> Tensor:
         expectations = [process.expectation(x)[..., 0] for process in self.processes]
         errors = self.layout.errors(x, self.order)
         flat = None if errors is None else [error[..., 0] for error in errors]
@@ -219,18 +233,19 @@ class ImpedanceKernel(BatchedKernel):
         total = force_covariance(expectations, expectations, variances, table, common, flat, flat)
         return total.expand(torch.broadcast_shapes(total.shape, x.shape[:-1]))
 
-    def trajectory_covariance(self, x1: Tensor, x2: Tensor, order: int) -> Tensor:
+    def trajectory_covariance(
+        self, x1: Tensor, x2: Tensor, order: int, derivatives: Derivatives | None = None
+    ) -> Tensor:
         """Cov[u, x_d⁽ʳ⁾'] = Σ_i E[w_i] ∂_tⁱ ∂_t'ʳ k_xd, r = `order`, `(..., n1, n2)` [N m/sʳ]."""
-        common, table = self._trajectory_table(x1, x2, order=2)
-        total = torch.zeros((), dtype=x1.dtype)
-        for i, process in enumerate(self.processes):
-            total = total + process.expectation(x1) * table[i][order]
+        common, table = self.derivatives(x1, x2) if derivatives is None else derivatives
+        total = self.processes[0].expectation(x1) * table[0][order]
+        for i, process in enumerate(self.processes[1:], start=1):
+            total = multiply_add(total, process.expectation(x1), table[i][order])
         return total * common
 
-    def trajectory_variance(self, x: Tensor, order: int) -> Tensor:
+    def trajectory_variance(self, x: Tensor, order: int, derivatives: Derivatives | None = None) -> Tensor:
         """Prior variance of x_d⁽ʳ⁾, r = `order`, `(..., n)` [m²/s²ʳ]."""
-        path = self.layout.path(x)
-        common, table = derivative_table(self.trajectory, path, path, 2, diag=True)
+        common, table = self.derivatives(x, x, diag=True) if derivatives is None else derivatives
         return common * table[order][order]
 
     def impedance_covariance(self, x1: Tensor, x2: Tensor, order: int) -> Tensor:
@@ -242,15 +257,10 @@ class ImpedanceKernel(BatchedKernel):
             return torch.zeros_like(k)
         return errors[order] * process.sensitivity(x1) * k
 
-    def _trajectory_table(self, x1: Tensor, x2: Tensor, order: int | None = None) -> tuple[Tensor, Table]:
-        common, table = derivative_table(
-            self.trajectory,
-            self.layout.path(x1),
-            self.layout.path(x2),
-            self.order if order is None else order,
-        )
-        shared = same_label(x1, x2, self.layout.trajectory)
-        return common if shared is None else common * shared, table
+    def _of_force(self, derivatives: Derivatives) -> Derivatives:
+        """Those up to the order that enters the force."""
+        common, table = derivatives
+        return common, [row[: self.order + 1] for row in table[: self.order + 1]]
 
     def _check_dtype(self, *inputs: Tensor) -> None:
         for x in inputs:
@@ -296,23 +306,41 @@ class LatentCovariances(Kernel):
         """E[u], one for each row of the covariance [N]."""
         return self.impedance.prior_mean(x)
 
-    def cross_covariance(self, x1: Tensor, x2: Tensor, latent: Latent) -> Tensor:
-        """Cov[u(x1), latent(x2)]; warped impedance enters by its logarithm (docs/model.md §4), or by its terms."""
-        if latent is Latent.FORCE:
-            return self.forward(x1, x2)
+    @abstractmethod
+    def covariance(self, x1: Tensor, x2: Tensor, derivatives: Any, diag: bool = False) -> Tensor:
+        """Cov[u, u'] for `derivatives` that are known already [N²]."""
+
+    def forward(self, x1: Tensor, x2: Tensor, diag: bool = False, **params: object) -> Tensor:
+        """Cov[u, u'], or Var[u] of single samples with `diag` [N²]."""
+        return self.covariance(x1, x2, self.impedance.derivatives(x1, x2, diag), diag)
+
+    def cross_covariance(
+        self, x1: Tensor, x2: Tensor, latent: Latent, derivatives: Any | None = None
+    ) -> Tensor:
+        """Cov[u(x1), latent(x2)]; warped impedance enters by its logarithm (docs/model.md §4), or by its terms.
+
+        `derivatives`: `impedance.derivatives(x1, x2)`, which several latents have in common, where known already.
+        """
         if latent is Latent.RESIDUAL_FORCE:
             return self.residual_covariance(x1, x2)
-        if latent in TRAJECTORY_ORDER:
-            return self.impedance.trajectory_covariance(x1, x2, TRAJECTORY_ORDER[latent])
-        return self.impedance.impedance_covariance(x1, x2, IMPEDANCE_ORDER[latent])
-
-    def prior_variance(self, x: Tensor, latent: Latent) -> Tensor:
-        """Prior variance of a latent that is no impedance."""
+        if latent in IMPEDANCE_ORDER:
+            return self.impedance.impedance_covariance(x1, x2, IMPEDANCE_ORDER[latent])
+        derivatives = self.impedance.derivatives(x1, x2) if derivatives is None else derivatives
         if latent is Latent.FORCE:
-            return self.forward(x, x, diag=True)
+            return self.covariance(x1, x2, derivatives)
+        return self.impedance.trajectory_covariance(x1, x2, TRAJECTORY_ORDER[latent], derivatives)
+
+    def prior_variance(self, x: Tensor, latent: Latent, derivatives: Any | None = None) -> Tensor:
+        """Prior variance of a latent that is no impedance.
+
+        `derivatives`: `impedance.derivatives(x, x, diag=True)`, where known already.
+        """
         if latent is Latent.RESIDUAL_FORCE:
             return self.residual_covariance(x, x, diag=True)
-        return self.impedance.trajectory_variance(x, TRAJECTORY_ORDER[latent])
+        derivatives = self.impedance.derivatives(x, x, diag=True) if derivatives is None else derivatives
+        if latent is Latent.FORCE:
+            return self.covariance(x, x, derivatives, diag=True)
+        return self.impedance.trajectory_variance(x, TRAJECTORY_ORDER[latent], derivatives)
 
 
 class InteractionKernel(LatentCovariances, BatchedKernel):
@@ -353,7 +381,12 @@ class InteractionKernel(LatentCovariances, BatchedKernel):
 
     def forward(self, x1: Tensor, x2: Tensor, diag: bool = False, **params: object) -> Tensor:
         """Cov[u, u'], `(..., n1, n2)`, or `(..., n)` with `diag` [N²]."""
-        total = self.impedance.forward(x1, x2, diag=diag)
+        derivatives = self.impedance.derivatives(x1, x2, diag, self.impedance.order)
+        return self.covariance(x1, x2, derivatives, diag)
+
+    def covariance(self, x1: Tensor, x2: Tensor, derivatives: Any, diag: bool = False) -> Tensor:
+        """Cov[u, u'] for `derivatives` that are known already, `(..., n1, n2)`, or `(..., n)` with `diag` [N²]."""
+        total = self.impedance.covariance(x1, x2, derivatives, diag)
         if self.motion_noise is not None:
             total = total + self.motion_noise.forward(x1, x2, diag=diag)
         return total if self.residual is None else total + self.residual_covariance(x1, x2, diag)
@@ -367,12 +400,12 @@ class InteractionKernel(LatentCovariances, BatchedKernel):
         shared = same_label(x1, x2, self.impedance.layout.residual, diag)
         return k if shared is None else k * shared
 
-    def prior_variance(self, x: Tensor, latent: Latent) -> Tensor:
+    def prior_variance(self, x: Tensor, latent: Latent, derivatives: Any | None = None) -> Tensor:
         """Prior variance of the latent, of its logarithm where warped, `(..., n)`."""
         if latent in IMPEDANCE_ORDER:
             process = self.impedance.processes[IMPEDANCE_ORDER[latent]]
             return process.gaussian_covariance(x, x, diag=True)
-        return super().prior_variance(x, latent)
+        return super().prior_variance(x, latent, derivatives)
 
 
 class InteractionMean(Mean):

@@ -60,7 +60,9 @@ class SampleInputs:
         starts |= {name: len(BY_AXIS) * axes + i for i, name in enumerate(scalars)}
         self._size = len(BY_AXIS) * axes + len(scalars) + 1
         zero = self._size - 1
-        self._starts = {name: slice(start, start + (axes if name in BY_AXIS else 1)) for name, start in starts.items()}
+        self._starts = {
+            name: slice(start, start + (axes if name in BY_AXIS else 1)) for name, start in starts.items()
+        }
         # Every column but errors is one of a sample's numbers, the same for each axis.
         self._index = np.full(feature_map.width, zero)
         needed = {"position", "velocity"}

@@ -57,7 +57,13 @@ class PredictorSnapshot:
         position, velocity = means[:, 0] + moments.mean[:, 1], means[:, 1] + moments.mean[:, 2]
         variance = moments.variance
         return Prediction(
-            force, variance[:, 0] + known.noise, position, variance[:, 1], velocity, variance[:, 2], moments.coverage
+            force,
+            variance[:, 0] + known.noise,
+            position,
+            variance[:, 1],
+            velocity,
+            variance[:, 2],
+            moments.coverage,
         )
 
 

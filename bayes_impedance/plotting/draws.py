@@ -24,7 +24,7 @@ from bayes_impedance.plotting.panels import (
     panel_grid,
     save_figure,
 )
-from bayes_impedance.posterior.compute import UNITS
+from bayes_impedance.posterior.results import UNITS
 from bayes_impedance.sampling.drawn import DrawnPosterior
 
 Array = NDArray[np.float64]

@@ -25,7 +25,7 @@ from bayes_impedance.plotting.panels import (
     panel_grid,
 )
 from bayes_impedance.posterior import Posterior, draw_matrices
-from bayes_impedance.posterior.compute import UNITS
+from bayes_impedance.posterior.results import UNITS
 from bayes_impedance.preprocessing import PreparedTrial
 
 Array = NDArray[np.float64]

@@ -21,7 +21,7 @@ from bayes_impedance.plotting.panels import (
     panel_grid,
 )
 from bayes_impedance.posterior import Marginal, Posterior
-from bayes_impedance.posterior.compute import UNITS
+from bayes_impedance.posterior.results import UNITS
 
 
 def plot_impedance(posterior: Posterior, verdicts: Iterable[Verdict], trial: int = 0) -> Figure:

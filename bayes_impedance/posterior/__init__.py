@@ -1,10 +1,9 @@
 """Gaussian posteriors of every latent, given forces."""
 
-from bayes_impedance.posterior.compute import Marginal as Marginal
-from bayes_impedance.posterior.compute import MatrixLaw as MatrixLaw
-from bayes_impedance.posterior.compute import Posterior as Posterior
-from bayes_impedance.posterior.compute import by_sample as by_sample
 from bayes_impedance.posterior.compute import compute_posterior as compute_posterior
-from bayes_impedance.posterior.compute import draw_matrices as draw_matrices
-from bayes_impedance.posterior.compute import marginal_of as marginal_of
-from bayes_impedance.posterior.compute import matrix_marginals as matrix_marginals
+from bayes_impedance.posterior.compute import infer_log as infer_log
+from bayes_impedance.posterior.results import Marginal as Marginal
+from bayes_impedance.posterior.results import MatrixLaw as MatrixLaw
+from bayes_impedance.posterior.results import Posterior as Posterior
+from bayes_impedance.posterior.results import draw_matrices as draw_matrices
+from bayes_impedance.posterior.results import matrix_marginals as matrix_marginals

@@ -3,204 +3,28 @@
 The covariance between the force and another process is the primitive: predicting x_d is the same code as
 predicting u. Warped impedance is conditioned in the logarithm, so its quantiles are positive.
 
-Here is what users see; the conditioning itself is in `posterior.independent` or, where axes are coupled, in
-`posterior.coupled`.
+The conditioning itself is in `posterior.independent` or, where axes are coupled, in `posterior.coupled`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from collections.abc import Callable, Iterator, Sequence
 
-import numpy as np
-import pandas as pd
 import torch
-from numpy.typing import NDArray
-from scipy.stats import norm
 from torch import Tensor
 
-from bayes_impedance.features import Features
+from bayes_impedance.features import Features, LogFeatures
 from bayes_impedance.kernels.coupled import CoupledInteractionKernel
-from bayes_impedance.kernels.coupled_terms import pair_names
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, InteractionKernel, Latent
-from bayes_impedance.posterior.conditioning import Moments, select_groups
-from bayes_impedance.posterior.coupled import CoupledConditioner, LogTerms, TermMoments
-from bayes_impedance.posterior.independent import IndependentConditioner, is_warped, prior_only
+from bayes_impedance.posterior.batches import Batch, Progress, for_each, plan
+from bayes_impedance.posterior.collected import Collected, axes_last
+from bayes_impedance.posterior.conditioning import pieces, select_groups, targets_at_once
+from bayes_impedance.posterior.coupled import CoupledConditioner, CoupledPrior
+from bayes_impedance.posterior.independent import IndependentConditioner, IndependentPrior, is_warped
+from bayes_impedance.posterior.results import Posterior, matrix_marginals
+from bayes_impedance.posterior.terms import LogTerms
 from bayes_impedance.preprocessing import PreparedLog
 from bayes_impedance.priors import ForceModel
-
-Array = NDArray[np.float64]
-
-UNITS: Mapping[Latent, str] = {
-    Latent.FORCE: "N",
-    Latent.RESIDUAL_FORCE: "N",
-    Latent.DESIRED_POSITION: "m",
-    Latent.DESIRED_VELOCITY: "m/s",
-    Latent.DESIRED_ACCELERATION: "m/s²",
-    Latent.STIFFNESS: "N/m",
-    Latent.DAMPING: "Ns/m",
-    Latent.MASS: "kg",
-}
-
-
-@dataclass(frozen=True)
-class Marginal:
-    """Posterior of one latent at each sample, beside its prior.
-
-    `location`, `scale`: mean and SD of the Gaussian variable, `(samples, axes)`: the latent, or its
-    logarithm where `warped`.
-
-    Example:
-        >>> location, scale = np.log([[300.0], [200.0]]), np.full((2, 1), 0.1)
-        >>> stiffness = Marginal(Latent.STIFFNESS, True, location, scale, location, 10 * scale)
-        >>> stiffness.quantile(0.5).round().tolist()
-        [[300.0], [200.0]]
-        >>> stiffness.contraction.round(2).tolist()
-        [0.99]
-    """
-
-    latent: Latent
-    warped: bool
-    location: Array
-    scale: Array
-    prior_location: Array
-    prior_scale: Array
-
-    @property
-    def mean(self) -> Array:
-        """Posterior mean, `(samples, axes)` [unit of the latent]."""
-        return np.exp(self.location + 0.5 * self.scale**2) if self.warped else self.location
-
-    @property
-    def sd(self) -> Array:
-        """Posterior SD, `(samples, axes)` [unit of the latent]."""
-        return self.mean * np.sqrt(np.expm1(self.scale**2)) if self.warped else self.scale
-
-    def quantile(self, probability: float) -> Array:
-        """Posterior quantile, `(samples, axes)` [unit of the latent]; positive where warped."""
-        return self._quantile(self.location, self.scale, probability)
-
-    def prior_quantile(self, probability: float) -> Array:
-        """Prior quantile, `(samples, axes)` [unit of the latent]."""
-        return self._quantile(self.prior_location, self.prior_scale, probability)
-
-    def draw(self, draws: int, generator: np.random.Generator, prior: bool = False) -> Array:
-        """Draws of each sample on its own, `(draws, samples, axes)` [unit of the latent]."""
-        location, scale = (self.prior_location, self.prior_scale) if prior else (self.location, self.scale)
-        value = location + scale * generator.standard_normal((draws, *location.shape))
-        return np.exp(value) if self.warped else value
-
-    @property
-    def contraction(self) -> Array:
-        """1 − posterior variance / prior variance of the Gaussian variable, averaged over samples, `(axes,)`."""
-        prior = np.square(self.prior_scale).mean(axis=0)
-        posterior = np.square(self.scale).mean(axis=0)
-        # A latent that the configuration fixes has no variance to lose.
-        return np.where(prior > 0, 1.0 - posterior / np.where(prior > 0, prior, 1.0), 0.0)
-
-    def _quantile(self, location: Array, scale: Array, probability: float) -> Array:
-        value = location + scale * norm.ppf(probability)
-        return np.asarray(np.exp(value) if self.warped else value)
-
-
-class MatrixLaw(Protocol):
-    """Joint law of the entries of K, D or M at each sample."""
-
-    def draw(self, draws: int, generator: np.random.Generator, prior: bool = False) -> Array:
-        """Matrices, `(draws, samples, axes, axes)` [unit of the matrix]; samples are drawn each on its own."""
-
-
-@dataclass(frozen=True)
-class Posterior:
-    """Posteriors of the latents at every sample of a log; immutable.
-
-    `marginals[latent]` holds arrays `(samples, axes)`, samples in the order of `log`'s trials; of a matrix its
-    diagonal, log-normal. Where axes are coupled `couplings[latent]` holds the
-    entries beside the diagonal, `(samples, pairs)`, as Gaussians, and `terms[latent]` what the matrix is made of.
-    """
-
-    log: PreparedLog
-    marginals: Mapping[Latent, Marginal]
-    couplings: Mapping[Latent, Marginal] = field(default_factory=dict)
-    terms: Mapping[Latent, MatrixLaw] = field(default_factory=dict)
-
-    def __getitem__(self, latent: Latent | str) -> Marginal:
-        """Marginal of a latent, by member of `Latent` or by name ("stiffness")."""
-        return self.marginals[Latent(latent)]
-
-    @property
-    def axes(self) -> tuple[str, ...]:
-        """Axes of the log."""
-        return self.log.axes
-
-    @property
-    def pairs(self) -> tuple[str, ...]:
-        """Pairs of axes that couple, in the order of `couplings`: xy, xz, yz; none where axes are independent."""
-        return pair_names(self.axes) if self.couplings else ()
-
-    def trial_slice(self, index: int) -> slice:
-        """Rows of trial `index` in the arrays of the marginals."""
-        start = sum(len(trial.time) for trial in self.log.trials[:index])
-        return slice(start, start + len(self.log.trials[index].time))
-
-    def table(self) -> pd.DataFrame:
-        """One row a sample: `trial`, `time` [s], then `<quantity>_<axis>_{mean,sd,q05,q95}` in SI units.
-
-        `source` and `group` precede where the log has several files or groups.
-        """
-        trials = self.log.trials
-        columns: dict[str, object] = {}
-        lengths = [len(trial.time) for trial in trials]
-        if len({trial.source for trial in trials}) > 1:
-            columns["source"] = np.repeat([trial.source for trial in trials], lengths)
-        if len({trial.group for trial in trials}) > 1:
-            columns["group"] = np.repeat([trial.group for trial in trials], lengths)
-        columns["trial"] = np.repeat([trial.name for trial in trials], lengths)
-        columns["time"] = np.concatenate([trial.time for trial in trials])
-        for latent, marginal in self.marginals.items():
-            doubled = [f"{axis}{axis}" if latent in IMPEDANCE_ORDER else axis for axis in self.axes]
-            columns |= _columns(marginal, doubled)
-            if latent in self.couplings:
-                columns |= _columns(self.couplings[latent], self.pairs)
-        return pd.DataFrame(columns)
-
-
-def _columns(marginal: Marginal, names: Sequence[str]) -> dict[str, object]:
-    columns: dict[str, object] = {}
-    low, high = marginal.quantile(0.05), marginal.quantile(0.95)
-    for a, name in enumerate(names):
-        columns[f"{marginal.latent.value}_{name}_mean"] = marginal.mean[:, a]
-        columns[f"{marginal.latent.value}_{name}_sd"] = marginal.sd[:, a]
-        columns[f"{marginal.latent.value}_{name}_q05"] = low[:, a]
-        columns[f"{marginal.latent.value}_{name}_q95"] = high[:, a]
-    return columns
-
-
-def draw_matrices(posterior: Posterior, draws: int, seed: int, prior: bool = False) -> Array:
-    """Draws of K [N/m], D [Ns/m] and M [kg] at each sample, `(draws, samples, 3, axes, axes)`, or of their prior.
-
-    Samples, and K, D and M, are drawn each on its own: what a draw shows is one instant, not a course along the path.
-    Diagonal where axes are independent.
-
-    Example:
-        >>> from bayes_impedance.simulation.generative import repeated_motion
-        >>> motion = repeated_motion(repetitions=1, duration=1.0, rate=2.0)
-        >>> level = np.full((2, 2), np.log(300.0))
-        >>> k = Marginal(Latent.STIFFNESS, True, level, 0.1 + 0 * level, level, 0.1 + 0 * level)
-        >>> posterior = Posterior(motion, {Latent.STIFFNESS: k, Latent.DAMPING: k, Latent.MASS: k})
-        >>> draw_matrices(posterior, 5, seed=0).shape
-        (5, 2, 3, 2, 2)
-    """
-    generator = np.random.default_rng(seed)
-    drawn = []
-    for latent in IMPEDANCE_ORDER:
-        if latent in posterior.terms:
-            drawn.append(posterior.terms[latent].draw(draws, generator, prior))
-        else:
-            diagonal = posterior[latent].draw(draws, generator, prior)
-            drawn.append(diagonal[..., None] * np.eye(diagonal.shape[-1]))
-    return np.stack(drawn, axis=2)
 
 
 def compute_posterior(
@@ -213,82 +37,103 @@ def compute_posterior(
 ) -> Posterior:
     """Posteriors at `target`, the features of `log`, given the forces of `given`; the prior where it is None.
 
-    Groups of `target` without a namesake in `given` keep their prior.
+    Groups of `target` without a namesake in `given` keep their prior. All groups are one batch: see `infer_log`.
 
     Raises:
         NotPositiveDefiniteError: the covariance of the given forces does not factorise.
     """
-    if latents is None:
-        has_impedance = isinstance(model.kernel, (InteractionKernel, CoupledInteractionKernel))
-        latents = list(Latent) if has_impedance else [Latent.FORCE]
+    latents = _latents_of(model) if latents is None else latents
     known = [] if given is None else [g for g in target.groups if g in given.groups]
     unknown = [g for g in target.groups if g not in known]
-    if model.is_coupled:
-        return _coupled_posterior(model, log, target, given, jitter, latents, (known, unknown))
-    parts: list[tuple[list[str], dict[Latent, Moments]]] = []
+    conditionings = _Conditionings(model, jitter, latents)
+    collected = Collected(log)
     with torch.no_grad():
-        if known:
-            assert given is not None
-            conditioner = IndependentConditioner(model, select_groups(given, known), jitter)
-            parts.append((known, conditioner.moments(select_groups(target, known), latents)))
-        if unknown:
-            parts.append((unknown, prior_only(model, select_groups(target, unknown), latents)))
-    return Posterior(log, {latent: marginal_of(model, log, target, latent, parts) for latent in latents})
+        for chosen, condition in ((known, given), (unknown, None)):
+            if chosen:
+                evidence = None if condition is None else select_groups(condition, chosen)
+                moments = conditionings.given(evidence)
+                rows = 0 if evidence is None else evidence.inputs[..., 0].numel()
+                for piece in pieces(select_groups(target, chosen), targets_at_once(rows)):
+                    collected.put(piece, moments(piece))
+    return _posterior(model, collected, latents)
 
 
-def _coupled_posterior(
-    model: ForceModel, log: PreparedLog, target: Features, given: Features | None, jitter: float,
-    latents: Sequence[Latent], groups: tuple[list[str], list[str]],
-) -> Posterior:  # fmt: skip
-    parts, terms = [], []
-    with torch.no_grad():
-        for chosen, condition in zip(groups, (given, None), strict=True):
-            if not chosen:
-                continue
-            evidence = None if condition is None else select_groups(condition, chosen)
-            conditioner = CoupledConditioner(model, evidence, jitter)
-            wanted = select_groups(target, chosen)
-            parts.append((chosen, conditioner.moments(wanted, latents)))
-            terms.append((chosen, conditioner.terms(wanted, latents)))
+def infer_log(
+    model: ForceModel,
+    target: LogFeatures,
+    given: LogFeatures | None,
+    jitter: float,
+    latents: Sequence[Latent] | None = None,
+    progress: Progress | None = None,
+) -> Posterior:
+    """Posteriors at every sample of the log of `target`, given all forces of that of `given`.
+
+    As `compute_posterior`, but in batches of groups of similar length, on as many threads as torch has. Numbers do not
+    depend on threads (but for the rounding of a single large group). Memory beyond logs and results is that of the
+    batches at work, whatever their number and the length of the log: see `conditioning.ENTRIES`.
+
+    Raises:
+        NotPositiveDefiniteError: the covariance of the given forces does not factorise.
+    """
+    latents = _latents_of(model) if latents is None else latents
+    log = target.log
+    conditionings = _Conditionings(model, jitter, latents)
+    collected = Collected(log)
+
+    def infer(batch: Batch) -> Iterator[int]:
+        with torch.no_grad():
+            evidence = None if given is None or not batch.given else given(batch.given, observed=True)
+            moments = conditionings.given(evidence)
+            for samples in batch.pieces:
+                piece = target(batch.target, samples=samples)
+                collected.put(piece, moments(piece), batch.target)
+                yield sum(len(rows) for rows in samples)
+
+    batches = plan(log, None if given is None else given.log, model.is_coupled)
+    for_each(infer, batches, log.n_samples, progress)
+    return _posterior(model, collected, latents)
+
+
+def _latents_of(model: ForceModel) -> list[Latent]:
+    has_impedance = isinstance(model.kernel, (InteractionKernel, CoupledInteractionKernel))
+    return list(Latent) if has_impedance else [Latent.FORCE]
+
+
+#: Moments of each latent at some targets, `(groups, m, …)` each.
+_Moments = Callable[[Features], dict[Latent, Sequence[Tensor]]]
+
+
+class _Conditionings:
+    """Forces of some groups at a time to moments of latents; what all have in common is computed once."""
+
+    def __init__(self, model: ForceModel, jitter: float, latents: Sequence[Latent]) -> None:
+        self._jitter, self._latents = jitter, latents
+        self._prior: CoupledPrior | IndependentPrior
+        with torch.no_grad():
+            self._prior = CoupledPrior(model) if model.is_coupled else IndependentPrior(model)
+
+    def given(self, evidence: Features | None) -> _Moments:
+        """Moments given the forces of `evidence`, or those of the prior."""
+        latents = self._latents
+        if isinstance(self._prior, CoupledPrior):
+            coupled = CoupledConditioner(self._prior, evidence, self._jitter)
+            return lambda target: {
+                **axes_last(coupled.moments(target, latents)),
+                **coupled.terms(target, latents),
+            }
+        source = self._prior
+        if evidence is None:
+            return lambda target: axes_last(source.moments(target, latents))
+        independent = IndependentConditioner(source, evidence, self._jitter)
+        return lambda target: axes_last(independent.moments(target, latents))
+
+
+def _posterior(model: ForceModel, collected: Collected, latents: Sequence[Latent]) -> Posterior:
     marginals, couplings, matrices = {}, {}, {}
     for latent in latents:
-        if latent not in IMPEDANCE_ORDER:
-            marginals[latent] = marginal_of(model, log, target, latent, parts)
-            continue
-        count = len(TermMoments._fields)
-        listed = [
-            by_sample(log, target, [(chosen, found[latent][i]) for chosen, found in terms])
-            for i in range(count)
-        ]
-        matrices[latent] = LogTerms(len(log.axes), *listed)
-        marginals[latent], couplings[latent] = matrix_marginals(latent, matrices[latent])
-    return Posterior(log, marginals, couplings, matrices)
-
-
-def matrix_marginals(latent: Latent, terms: LogTerms) -> tuple[Marginal, Marginal]:
-    """Marginals of the diagonal of a matrix, `(samples, axes)`, and of the entries beside it, `(samples, pairs)`."""
-    diagonal = Marginal(latent, True, *terms.diagonal(), *terms.diagonal(prior=True))
-    return diagonal, Marginal(latent, False, *terms.off_diagonal(), *terms.off_diagonal(prior=True))
-
-
-def marginal_of(
-    model: ForceModel, log: PreparedLog, target: Features, latent: Latent,
-    parts: Sequence[tuple[list[str], dict[Latent, Moments]]],
-) -> Marginal:  # fmt: skip
-    """Undo the batching: rows of groups back to samples of trials."""
-    # `(groups, m, axes, 4)`
-    batches = [(groups, torch.stack(moments[latent]).permute(2, 3, 1, 0)) for groups, moments in parts]
-    location, variance, prior_location, prior_variance = np.moveaxis(by_sample(log, target, batches), -1, 0)
-    warped = is_warped(model, latent)
-    return Marginal(latent, warped, location, np.sqrt(variance), prior_location, np.sqrt(prior_variance))
-
-
-def by_sample(log: PreparedLog, target: Features, batches: Sequence[tuple[list[str], Tensor]]) -> Array:
-    """Values `(groups, m, …)` of batches of groups as `(samples, …)`, in the order of the log's trials."""
-    starts = np.cumsum([0, *(len(trial.time) for trial in log.trials)])
-    values = np.empty((starts[-1], *batches[0][1].shape[2:]))
-    for groups, batch in batches:
-        for g, group in enumerate(groups):
-            rows = target.rows[target.groups.index(group)]
-            values[starts[rows[:, 0]] + rows[:, 1]] = batch[g, : len(rows)].numpy()
-    return values
+        if model.is_coupled and latent in IMPEDANCE_ORDER:
+            matrices[latent] = LogTerms(len(collected.log.axes), *collected.take(latent))
+            marginals[latent], couplings[latent] = matrix_marginals(latent, matrices[latent])
+        else:
+            marginals[latent] = collected.marginal(latent, is_warped(model, latent))
+    return Posterior(collected.log, marginals, couplings, matrices)

@@ -1,26 +1,30 @@
-"""What posteriors of independent and of coupled axes have in common: batches, levels as offsets, logarithms."""
+"""What posteriors of independent and of coupled axes have in common: pieces, levels as offsets, logarithms."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from bayes_impedance.features import Features
-from bayes_impedance.priors import Entry, ForceModel
 
 #: Location, variance, prior location, prior variance, each `(axes, groups, m)`.
 Moments = tuple[Tensor, Tensor, Tensor, Tensor]
 
-#: Targets are taken this many at a time, which bounds memory whatever the length of the log.
+#: Targets are taken at most this many at a time,
 CHUNK = 512
+#: and at most so many that a covariance with the forces given has this many entries, 2 MB: with the thirty or so arrays
+#: of its size that are in use at a time, memory is bounded whatever the length of the log, and most of it is cache.
+ENTRIES = 2**18
+#: But so many are: a solve with fewer columns takes as long.
+FEWEST = 32
 
 
-def entry_of(model: ForceModel, name: str) -> Entry:
-    """The hyperparameter of that name."""
-    return next(entry for entry in model.entries if entry.name == name)
+def targets_at_once(rows: int) -> int:
+    """How many targets to take at a time where each has `rows` covariances with forces, over all axes and groups."""
+    return min(CHUNK, max(FEWEST, ENTRIES // max(1, rows)))
 
 
 def offset_covariance(gram: Tensor, variance: Tensor) -> Tensor:
@@ -63,17 +67,15 @@ def select_groups(features: Features, groups: Sequence[str]) -> Features:
     )
 
 
-def chunks(features: Features) -> list[Features]:
-    """The inputs in pieces of `CHUNK` samples, without force."""
-    starts = range(0, features.inputs.shape[2], CHUNK)
-    pieces = [slice(start, start + CHUNK) for start in starts]
-    return [
-        replace(
+def pieces(features: Features, size: int) -> Iterator[Features]:
+    """The inputs in pieces of at most `size` samples a group, without force."""
+    for start in range(0, features.inputs.shape[2], size):
+        piece = slice(start, start + size)
+        yield replace(
             features,
             inputs=features.inputs[:, :, piece],
             force=None,
             trajectory_mean=features.trajectory_mean[:, :, piece],
-            valid=None,
+            valid=None if features.valid is None else features.valid[:, piece],
+            rows=tuple(rows[piece] for rows in features.rows),
         )
-        for piece in pieces
-    ]

@@ -7,7 +7,7 @@ where ē = 0 (the equilibrium prior) the posterior of an impedance keeps the who
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -16,32 +16,39 @@ from torch import Tensor
 from bayes_impedance.engines.closed_loop import LoopEvidence
 from bayes_impedance.engines.dense import Factor
 from bayes_impedance.features import Features
-from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, TRAJECTORY_ORDER, InteractionKernel, Latent
-from bayes_impedance.kernels.warped import ImpedanceProcess
-from bayes_impedance.posterior.conditioning import Moments, chunks, entry_of, offset_covariance, unwarped
-from bayes_impedance.priors import ForceModel
+from bayes_impedance.kernels.impedance import (
+    IMPEDANCE_ORDER,
+    TRAJECTORY_ORDER,
+    Derivatives,
+    InteractionKernel,
+    Latent,
+)
+from bayes_impedance.kernels.warped import ImpedanceProcess, evaluate
+from bayes_impedance.posterior.conditioning import Moments, offset_covariance, unwarped
+from bayes_impedance.priors import Entry, ForceModel
 from bayes_impedance.training import observations
 
 
 class IndependentConditioner:
-    """Forces given once, conditioned on for any number of targets.
+    """Forces given once, conditioned on for any number of targets; the prior's constants are those of `prior`.
 
     Raises:
         NotPositiveDefiniteError: the covariance of the given forces does not factorise.
     """
 
-    def __init__(self, model: ForceModel, given: Features, jitter: float) -> None:
-        self.model, self.given = model, given
-        forces = observations(model, given)
-        self.factor = Factor(model.kernel, forces, jitter)
-        variance = level_variance(model)
-        self.has_levels = variance is not None
-        if variance is not None:
-            self.white_loading = self.factor.whiten(level_loading(model, given.inputs, Latent.FORCE))
-            self.level_covariance = offset_covariance(self.white_loading.mT @ self.white_loading, variance)
+    def __init__(self, prior: IndependentPrior, given: Features, jitter: float) -> None:
+        self.prior, self.model, self.given = prior, prior.model, given
+        forces = observations(self.model, given)
+        self.factor = Factor(self.model.kernel, forces, jitter)
+        self.has_levels = prior.level_variance is not None
+        if prior.level_variance is not None:
+            self.white_loading = self.factor.whiten(level_loading(self.model, given.inputs, Latent.FORCE))
+            self.level_covariance = offset_covariance(
+                self.white_loading.mT @ self.white_loading, prior.level_variance
+            )
         self.loop = None
         if given.loop is not None:
-            self.loop = LoopEvidence(model.kernel.impedance, self.factor, forces, given.loop)
+            self.loop = LoopEvidence(self.model.kernel.impedance, self.factor, forces, given.loop)
             loading = self.loop.apparent.loading - self.loop.white.mT @ self.white_loading
             self.loop_loading = self.level_covariance @ loading.mT
             variance = self.loop.variance + (loading @ self.loop_loading).sum((-2, -1))
@@ -49,17 +56,19 @@ class IndependentConditioner:
 
     def moments(self, target: Features, latents: Sequence[Latent]) -> dict[Latent, Moments]:
         """Moments of each latent at the samples of `target`."""
+        x = target.inputs
+        derivatives = self.prior.derivatives(self.given.inputs, x, latents)
         result = {}
-        for latent in latents:
-            pieces = [self._chunk(piece, latent) for piece in chunks(target)]
-            a, b, c, d = zip(*pieces, strict=True)
-            result[latent] = tuple(torch.cat(part, dim=-1) for part in (a, b, c, d))
-        return result  # type: ignore[return-value]
+        for latent, prior in self.prior.at(target, latents).items():
+            # A constant has one covariance with a force, whatever the target.
+            at = x[..., :1, :] if self.prior.is_constant(latent) else x
+            cross = self._cross_covariance(at, latent, derivatives)
+            moments = self._moments(at, latent, prior, cross)
+            result[latent] = _broadcast(x.shape[:-1], *moments)
+        return result
 
-    def _chunk(self, target: Features, latent: Latent) -> Moments:
-        cross = _cross_covariance(self.model, self.given.inputs, target.inputs, latent)
+    def _moments(self, x: Tensor, latent: Latent, prior: LatentPrior, cross: Tensor) -> Sequence[Tensor]:
         white = self.factor.whiten(cross)
-        prior = prior_of(self.model, target, latent)
         # On padding α is zero.
         location = prior.location + (cross.mT @ self.factor.alpha.unsqueeze(-1)).squeeze(-1)
         # Rounding can push the variance of a fully determined variable just below zero.
@@ -69,7 +78,7 @@ class IndependentConditioner:
             loading = prior.loading - white.mT @ self.white_loading
             variance = variance + ((loading @ self.level_covariance) * loading).sum(-1)
         if self.loop is not None:
-            with_loop = self.loop.covariance(target.inputs, latent, white)
+            with_loop = self.loop.covariance(x, latent, white)
             location = location + with_loop * self.loop.jacobian.slope.unsqueeze(-1)
             with_loop = with_loop + (loading @ self.loop_loading).squeeze(-1)
             variance = (variance - with_loop.square() * self.loop_gain).clamp_min(0.0)
@@ -77,7 +86,13 @@ class IndependentConditioner:
             location = unwarped(location, prior.location, known, prior.own_variance)
         if latent is Latent.FORCE:
             variance = variance + self.model.noise_variance
-        return location, variance, prior.shown.expand_as(location), prior.variance.expand_as(location)
+        return location, variance, prior.shown, prior.variance
+
+    def _cross_covariance(self, x: Tensor, latent: Latent, derivatives: Derivatives | None) -> Tensor:
+        kernel = self.model.kernel
+        if isinstance(kernel, InteractionKernel):
+            return kernel.cross_covariance(self.given.inputs, x, latent, derivatives)
+        return evaluate(kernel, self.given.inputs, x)
 
 
 def is_warped(model: ForceModel, latent: Latent) -> bool:
@@ -88,31 +103,7 @@ def is_warped(model: ForceModel, latent: Latent) -> bool:
     return process.law == "log_gaussian"
 
 
-def prior_only(model: ForceModel, target: Features, latents: Sequence[Latent]) -> dict[Latent, Moments]:
-    """Moments of each latent where no force is given."""
-    result = {}
-    shape = target.inputs.shape[:-1]
-    for latent in latents:
-        prior = prior_of(model, target, latent)
-        location, variance = prior.location.expand(shape), prior.variance.expand(shape)
-        result[latent] = (location, variance, prior.shown.expand(shape), variance)
-    return result
-
-
-def _cross_covariance(model: ForceModel, x1: Tensor, x2: Tensor, latent: Latent) -> Tensor:
-    if isinstance(model.kernel, InteractionKernel):
-        return model.kernel.cross_covariance(x1, x2, latent)
-    return model.kernel(x1, x2).to_dense()
-
-
-def _own_variance(model: ForceModel, target: Features, latent: Latent) -> Tensor:
-    """Prior variance at known levels, without noise."""
-    if isinstance(model.kernel, InteractionKernel):
-        return model.kernel.prior_variance(target.inputs, latent)
-    return model.kernel(target.inputs, diag=True)
-
-
-class Prior(NamedTuple):
+class LatentPrior(NamedTuple):
     """Prior of a latent at some samples, `(axes, groups, m)` each or what broadcasts to it.
 
     `location` at the fitted levels, `shown` before training; `own_variance` at known levels and without noise,
@@ -126,36 +117,90 @@ class Prior(NamedTuple):
     loading: Tensor
 
 
-def prior_of(model: ForceModel, target: Features, latent: Latent) -> Prior:
-    """Prior of a latent at the samples of `target`."""
-    own = _own_variance(model, target, latent)
-    loading = level_loading(model, target.inputs, latent)
-    levels = level_variance(model)
-    variance = own if levels is None else own + (loading.square() * levels.unsqueeze(-2)).sum(-1)
-    if latent is Latent.FORCE:
-        location = model.prior_mean(target.inputs)
-        return Prior(location, location, own, variance + model.noise_variance, loading)
-    if latent is Latent.RESIDUAL_FORCE:
-        location = torch.zeros_like(own)
-        return Prior(location, location, own, variance, loading)
-    if latent in TRAJECTORY_ORDER:
-        location = target.trajectory_mean[..., TRAJECTORY_ORDER[latent]]
-        return Prior(location, location, own, variance, loading)
-    process = model.kernel.impedance.processes[IMPEDANCE_ORDER[latent]]
-    level, median = process.level[..., 0], entry_of(model, f"{latent.value}.level").medians
-    if process.law == "log_gaussian":
-        level, median = level.log(), median.log()
-    return Prior(level, median, own, variance, loading)
+class IndependentPrior:
+    """Prior of every latent; what does not depend on the samples is computed once."""
+
+    def __init__(self, model: ForceModel) -> None:
+        self.model = model
+        self.level_variance: Tensor | None = None
+        self._medians: dict[Latent, Tensor] = {}
+        if isinstance(model.kernel, InteractionKernel):
+            entries = {entry.name: entry for entry in model.entries}
+            levels = {latent: entries[f"{latent.value}.level"] for latent in IMPEDANCE_ORDER}
+            self._medians = {latent: entry.medians for latent, entry in levels.items()}
+            self.level_variance = _level_variance(model, levels)
+
+    def moments(self, target: Features, latents: Sequence[Latent]) -> dict[Latent, Moments]:
+        """Moments of each latent at the samples of `target`, where no force is given."""
+        shape = target.inputs.shape[:-1]
+        return {
+            latent: _broadcast(shape, prior.location, prior.variance, prior.shown, prior.variance)
+            for latent, prior in self.at(target, latents).items()
+        }
+
+    def derivatives(
+        self, x1: Tensor, x2: Tensor, latents: Sequence[Latent], diag: bool = False
+    ) -> Derivatives | None:
+        """Those of the desired trajectory, which its latents and the force have in common; None without any."""
+        kernel = self.model.kernel
+        shared = any(latent in TRAJECTORY_ORDER or latent is Latent.FORCE for latent in latents)
+        if not shared or not isinstance(kernel, InteractionKernel):
+            return None
+        return kernel.impedance.derivatives(x1, x2, diag)
+
+    def is_constant(self, latent: Latent) -> bool:
+        """Whether it is an impedance that no input changes."""
+        kernel = self.model.kernel
+        if latent not in IMPEDANCE_ORDER or not isinstance(kernel, InteractionKernel):
+            return False
+        return kernel.impedance.processes[IMPEDANCE_ORDER[latent]].covariance.num_dims == 0
+
+    def at(self, target: Features, latents: Sequence[Latent]) -> dict[Latent, LatentPrior]:
+        """Prior of each latent at the samples of `target`."""
+        x = target.inputs
+        derivatives = self.derivatives(x, x, latents, diag=True)
+        return {latent: self._at(target, latent, derivatives) for latent in latents}
+
+    def _at(self, target: Features, latent: Latent, derivatives: Derivatives | None) -> LatentPrior:
+        model = self.model
+        own = self._own_variance(target.inputs, latent, derivatives)
+        loading = level_loading(model, target.inputs, latent)
+        variance = own
+        if self.level_variance is not None:
+            variance = own + (loading.square() * self.level_variance.unsqueeze(-2)).sum(-1)
+        if latent is Latent.FORCE:
+            location = model.prior_mean(target.inputs)
+            return LatentPrior(location, location, own, variance + model.noise_variance, loading)
+        if latent is Latent.RESIDUAL_FORCE:
+            location = torch.zeros_like(own)
+            return LatentPrior(location, location, own, variance, loading)
+        if latent in TRAJECTORY_ORDER:
+            location = target.trajectory_mean[..., TRAJECTORY_ORDER[latent]]
+            return LatentPrior(location, location, own, variance, loading)
+        process = model.kernel.impedance.processes[IMPEDANCE_ORDER[latent]]
+        level, median = process.level[..., 0], self._medians[latent]
+        if process.law == "log_gaussian":
+            level, median = level.log(), median.log()
+        return LatentPrior(level, median, own, variance, loading)
+
+    def _own_variance(self, x: Tensor, latent: Latent, derivatives: Derivatives | None) -> Tensor:
+        """Prior variance at known levels, without noise."""
+        kernel = self.model.kernel
+        if isinstance(kernel, InteractionKernel):
+            return kernel.prior_variance(x, latent, derivatives)
+        return evaluate(kernel, x, x, diag=True)
 
 
-def level_variance(model: ForceModel) -> Tensor | None:
-    """Var[b_j], `(axes, 1, 3)`; None for a naive GP."""
-    if not isinstance(model.kernel, InteractionKernel):
-        return None
+def _broadcast(shape: torch.Size, a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Moments:
+    return a.expand(shape), b.expand(shape), c.expand(shape), d.expand(shape)
+
+
+def _level_variance(model: ForceModel, levels: Mapping[Latent, Entry]) -> Tensor:
+    """Var[b_j], `(axes, 1, 3)`."""
     variances = []
     for latent, order in IMPEDANCE_ORDER.items():
         process = model.kernel.impedance.processes[order]
-        spec = entry_of(model, f"{latent.value}.level").specs[0]
+        spec = levels[latent].specs[0]
         log_sd = 0.0 if spec.fixed else spec.log_sd
         level = process.level[..., 0]
         scale = level if process.law == "gaussian" else torch.ones_like(level)

@@ -6,7 +6,7 @@ has learned of the force. Levels that were learned are offsets, as in `posterior
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,54 +19,60 @@ from bayes_impedance.engines.local.build import build_local
 from bayes_impedance.engines.local.cell import Cell, whitened
 from bayes_impedance.engines.local.grid import weights_of
 from bayes_impedance.errors import ConfigurationError
-from bayes_impedance.features import FeatureMap, Features
+from bayes_impedance.features import FeatureMap, Features, LogFeatures
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
-from bayes_impedance.posterior.compute import Posterior, marginal_of
-from bayes_impedance.posterior.conditioning import (
-    Moments,
-    chunks,
-    offset_covariance,
-    select_groups,
-    unwarped,
-)
+from bayes_impedance.posterior.batches import Batch, Progress, each_group, for_each
+from bayes_impedance.posterior.collected import Collected, axes_last
+from bayes_impedance.posterior.conditioning import Moments, offset_covariance, unwarped
 from bayes_impedance.posterior.independent import (
-    Prior,
+    IndependentPrior,
+    LatentPrior,
     is_warped,
     level_loading,
-    level_variance,
-    prior_of,
-    prior_only,
 )
-from bayes_impedance.preprocessing import PreparedLog
+from bayes_impedance.posterior.results import Posterior
 from bayes_impedance.priors import ForceModel
 from bayes_impedance.training import observations
 
 Array = NDArray[np.float64]
 
 
-def local_posterior(
-    model: ForceModel, feature_map: FeatureMap, settings: LocalConfig, log: PreparedLog,
-    target: Features, given: Features | None, latents: Sequence[Latent] | None = None,
-) -> Posterior:  # fmt: skip
-    """Posteriors at `target`, the features of `log`, given the forces of `given`; the prior where it is None.
+def infer_local(
+    model: ForceModel,
+    target: LogFeatures,
+    given: LogFeatures | None,
+    settings: LocalConfig,
+    latents: Sequence[Latent] | None = None,
+    progress: Progress | None = None,
+) -> Posterior:
+    """Posteriors at every sample of the log of `target`, given the forces of that of `given`; the prior where it is None.
 
     Groups of `target` without a namesake in `given` keep their prior, and so do samples outside of the range of motion
-    of `given`.
+    of `given`. Memory beyond logs and results is that of the cells of the groups at work.
 
     Raises:
         ConfigurationError: see `LocalConditioner`.
     """
     latents = list(Latent) if latents is None else latents
-    parts: list[tuple[list[str], dict[Latent, Moments]]] = []
-    with torch.no_grad():
-        for group in target.groups:
-            own = select_groups(target, [group])
-            if given is None or group not in given.groups:
-                parts.append(([group], prior_only(model, own, latents)))
-                continue
-            conditioner = LocalConditioner(model, feature_map, settings, select_groups(given, [group]))
-            parts.append(([group], conditioner.moments(own, latents)))
-    return Posterior(log, {latent: marginal_of(model, log, target, latent, parts) for latent in latents})
+    log = target.log
+    prior = IndependentPrior(model)
+    collected = Collected(log)
+
+    def infer(batch: Batch) -> Iterator[int]:
+        with torch.no_grad():
+            source: IndependentPrior | LocalConditioner = prior
+            if given is not None and batch.given:
+                forces = given(batch.given, observed=True)
+                source = LocalConditioner(prior, target.feature_map, settings, forces)
+            for samples in batch.pieces:
+                piece = target(batch.target, samples=samples)
+                collected.put(piece, axes_last(source.moments(piece, latents)), batch.target)
+                yield sum(len(rows) for rows in samples)
+
+    for_each(infer, each_group(log, None if given is None else given.log), log.n_samples, progress)
+    return Posterior(
+        log, {latent: collected.marginal(latent, is_warped(model, latent)) for latent in latents}
+    )
 
 
 class _Learned(NamedTuple):
@@ -92,28 +98,29 @@ class LocalConditioner:
     """
 
     def __init__(
-        self, model: ForceModel, feature_map: FeatureMap, settings: LocalConfig, given: Features
+        self, prior: IndependentPrior, feature_map: FeatureMap, settings: LocalConfig, given: Features
     ) -> None:
         if given.loop is not None:
             raise ConfigurationError(
                 "device: expected none with engine.name: local, which takes the recorded motion as given, got a robot "
                 "whose answer tells of the mass; set engine.name=dense, or device=null"
             )
-        self.model = model
-        self.kernels = [model.kernel[axis, 0] for axis in range(len(feature_map.axes))]
+        self.prior, self.model = prior, prior.model
         n = len(given.rows[0])
         inputs = np.ascontiguousarray(given.inputs[:, 0, :n].numpy())
-        self.local = build_local(model, feature_map, settings, inputs[0])
-        self.local.learn_all(inputs, observations(model, given).residual[:, 0, :n].numpy())
-        loading = level_loading(model, given.inputs, Latent.FORCE)[:, 0, :n].numpy()
-        variance = level_variance(model)
-        assert variance is not None
+        self.local = build_local(self.model, feature_map, settings, inputs[0])
+        self.local.learn_all(inputs, observations(self.model, given).residual[:, 0, :n].numpy())
+        self.kernels = [self.model.kernel[axis, 0] for axis in range(len(inputs))]
+        loading = level_loading(self.model, given.inputs, Latent.FORCE)[:, 0, :n].numpy()
+        assert prior.level_variance is not None
         codes, _ = weights_of(self.local.grid, inputs[0], settings.active)
         self.learned: dict[int, list[_Learned]] = {}
         for code, cell in self.local.cells.items():
             rows = np.flatnonzero((codes == code).any(axis=1))
             self.learned[code] = [
-                self._learned(cell, axis, inputs[axis, rows], loading[axis, rows], variance[axis, 0])
+                self._learned(
+                    cell, axis, inputs[axis, rows], loading[axis, rows], prior.level_variance[axis, 0]
+                )
                 for axis in range(len(inputs))
             ]
 
@@ -135,21 +142,18 @@ class LocalConditioner:
 
     def moments(self, target: Features, latents: Sequence[Latent]) -> dict[Latent, Moments]:
         """Moments of each latent at the samples of `target`, of the same group."""
-        found: dict[Latent, Moments] = {}
-        for latent in latents:
-            pieces = [self._chunk(piece, latent) for piece in chunks(target)]
-            a, b, c, d = zip(*pieces, strict=True)
-            found[latent] = (torch.cat(a, -1), torch.cat(b, -1), torch.cat(c, -1), torch.cat(d, -1))
-        return found
+        return {
+            latent: self._moments(target, latent, prior)
+            for latent, prior in self.prior.at(target, latents).items()
+        }
 
-    def _chunk(self, target: Features, latent: Latent) -> Moments:
-        prior = prior_of(self.model, target, latent)
+    def _moments(self, target: Features, latent: Latent, prior: LatentPrior) -> Moments:
         shape = target.inputs.shape[:-1]
         prior_location, prior_variance = prior.location.expand(shape), prior.variance.expand(shape)
         codes, weights = weights_of(self.local.grid, target.inputs[0, 0].numpy(), self.local.settings.active)
         # Σ g, Σ g mean, Σ g (variance + mean²)
         total = torch.zeros(3, *shape, dtype=prior_variance.dtype)
-        for code in np.unique(codes):
+        for code in np.unique(codes).tolist():
             if code not in self.learned:
                 continue
             rows, places = np.nonzero(codes == code)
@@ -168,11 +172,20 @@ class LocalConditioner:
         return location, variance, prior.shown.expand(shape), prior_variance
 
     def _of_cell(
-        self, learned: _Learned, axis: int, target: Features, rows: NDArray[np.int64], prior: Prior, latent: Latent
+        self,
+        learned: _Learned,
+        axis: int,
+        target: Features,
+        rows: NDArray[np.int64],
+        prior: LatentPrior,
+        latent: Latent,
     ) -> tuple[Tensor, Tensor]:
         """Location and variance, without noise, that a cell gives some samples of an axis, `(m,)` each."""
         shape = target.inputs.shape[:-1]
-        location, own = prior.location.expand(shape)[axis, 0, rows], prior.own_variance.expand(shape)[axis, 0, rows]
+        location, own = (
+            prior.location.expand(shape)[axis, 0, rows],
+            prior.own_variance.expand(shape)[axis, 0, rows],
+        )
         cross = self.kernels[axis].cross_covariance(learned.inducing, target.inputs[axis, 0, rows], latent)
         a = torch.linalg.solve_triangular(learned.prior, cross, upper=False)
         v = torch.linalg.solve_triangular(learned.posterior, a, upper=False)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bayes_impedance.config import dump_config
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, TRAJECTORY_ORDER, Latent
 from bayes_impedance.outputs import whole_file
-from bayes_impedance.posterior.compute import UNITS
+from bayes_impedance.posterior.results import UNITS
 from bayes_impedance.sampling.drawn import DrawnPosterior
 from bayes_impedance.sampling.parameters import QUANTITIES, Parameter
 

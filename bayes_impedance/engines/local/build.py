@@ -47,7 +47,9 @@ def build_local(
             )
         columns += own
         width += [value] * len(own) if np.ndim(value) == 0 else list(np.ravel(value))
-    return LocalModel(numbers, noise, _grid(visited[:, columns], columns, np.array(width)), settings, feature_map.width)
+    return LocalModel(
+        numbers, noise, _grid(visited[:, columns], columns, np.array(width)), settings, feature_map.width
+    )
 
 
 def _grid(visited: Floats, columns: list[int], width: Floats) -> Grid:

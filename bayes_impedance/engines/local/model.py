@@ -181,7 +181,10 @@ class LocalModel:
         """
         if code in self.cells:
             return self.cells[code]
-        if code < 0 or len(self.cells) + sum(one not in self.cells for one in learning) >= self.settings.cells:
+        if (
+            code < 0
+            or len(self.cells) + sum(one not in self.cells for one in learning) >= self.settings.cells
+        ):
             return None
         axes, inducing = self.noise.size, self.settings.inducing
         self.sums[code] = Sums.empty(axes, inducing)
@@ -206,7 +209,9 @@ def mixture(weights: Floats, means: Floats, variances_: Floats) -> tuple[Floats,
 
 
 @njit(cache=True, nogil=True)
-def _prepare(numbers: KernelNumbers, grid: Grid, x: Floats, active: int) -> tuple[Floats, Integers, Floats, bool]:
+def _prepare(
+    numbers: KernelNumbers, grid: Grid, x: Floats, active: int
+) -> tuple[Floats, Integers, Floats, bool]:
     """Prior variances, and nearest cells with their weights."""
     codes, weights = np.full(active, -1), np.zeros(active)
     inside = nearest(grid, x[0], codes, weights)
