@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from bayes_impedance.errors import ConfigurationError, LogError
 from bayes_impedance.features import FeatureMap
 from bayes_impedance.online.sample import Sample
-from bayes_impedance.trajectory_mean import TrajectoryMean
+from bayes_impedance.trajectory_mean import Instant, TrajectoryMean
 
 Floats = NDArray[np.float64]
 
@@ -24,24 +23,6 @@ DERIVATIVES = {
 BY_AXIS = ("position", "velocity", "acceleration", "jerk")
 #: What the mean of the desired trajectory is made of.
 REFERENCE = ("reference", "reference_velocity", "reference_acceleration")
-
-
-@dataclass(frozen=True)
-class _Instant:
-    """A sample as the mean of the desired trajectory sees a trial: arrays of one row."""
-
-    name: str
-    group: str
-    source: str
-    position: Floats
-    velocity: Floats
-    acceleration: Floats
-    phase: Floats | None
-    phase_velocity: Floats | None
-    phase_acceleration: Floats | None
-    reference: Floats | None
-    reference_velocity: Floats | None
-    reference_acceleration: Floats | None
 
 
 class SampleInputs:
@@ -60,7 +41,9 @@ class SampleInputs:
         starts |= {name: len(BY_AXIS) * axes + i for i, name in enumerate(scalars)}
         self._size = len(BY_AXIS) * axes + len(scalars) + 1
         zero = self._size - 1
-        self._starts = {name: slice(start, start + (axes if name in BY_AXIS else 1)) for name, start in starts.items()}
+        self._starts = {
+            name: slice(start, start + (axes if name in BY_AXIS else 1)) for name, start in starts.items()
+        }
         # Every column but errors is one of a sample's numbers, the same for each axis.
         self._index = np.full(feature_map.width, zero)
         needed = {"position", "velocity"}
@@ -144,11 +127,12 @@ class SampleInputs:
         for name in DERIVATIVES["phase"]:
             own[name] = values[self._starts[name]] if name in self.needed else None
         motion = dict(zip(("position", "velocity", "acceleration"), hand.T[:, None], strict=True))
-        instant = _Instant(name="stream", group=self._group, source="sample", **motion, **own)
+        instant = Instant(name="stream", group=self._group, source="sample", **motion, **own)
         desired = self._mean.derivatives(instant)[:, 0].T
         if not np.isfinite(desired).all():
             raise LogError(
-                f"sample at {sample.time} s: expected a finite reference, found {desired.tolist()}; leave the sample out"
+                f"sample at {sample.time} s: expected a finite reference, found {desired.tolist()}; leave the "
+                "sample out"
             )
         return desired
 

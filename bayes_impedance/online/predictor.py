@@ -57,7 +57,13 @@ class PredictorSnapshot:
         position, velocity = means[:, 0] + moments.mean[:, 1], means[:, 1] + moments.mean[:, 2]
         variance = moments.variance
         return Prediction(
-            force, variance[:, 0] + known.noise, position, variance[:, 1], velocity, variance[:, 2], moments.coverage
+            force,
+            variance[:, 0] + known.noise,
+            position,
+            variance[:, 1],
+            velocity,
+            variance[:, 2],
+            moments.coverage,
         )
 
 
@@ -75,7 +81,8 @@ class OnlinePredictor:
         >>> log = draw_force(model.config, repeated_motion(repetitions=1, duration=2.0, rate=10.0), seed=0)
         >>> predictor = OnlinePredictor(model.fit(log))
         >>> trial = log.trials[0]
-        >>> one = Sample(9.0, trial.position[3], trial.velocity[3], trial.force[3], trial.acceleration[3], trial.jerk[3])
+        >>> motion = trial.position[3], trial.velocity[3]
+        >>> one = Sample(9.0, *motion, trial.force[3], trial.acceleration[3], trial.jerk[3])
         >>> predictor.update(one).name, predictor.samples
         ('LEARNED', 21)
         >>> predictor.predict(one).force.shape
@@ -89,10 +96,10 @@ class OnlinePredictor:
         log = model.fitted.log
         if model.config.engine.impedance == "map":
             raise ConfigurationError(
-                "engine.impedance: expected moments to predict online, got map, whose functions are found anew from all "
-                "samples; train with engine.impedance=moments"
+                "engine.impedance: expected moments to predict online, got map, whose functions are found anew from "
+                "all samples; train with engine.impedance=moments"
             )
-        if group is None and len(log.groups) > 1 or group is not None and group not in log.groups:
+        if group not in log.groups and (group is not None or len(log.groups) > 1):
             raise ConfigurationError(
                 f"group: expected one of {', '.join(log.groups)}, got {group}; name the one that holds the handle"
             )
@@ -164,7 +171,7 @@ class OnlinePredictor:
 
     @classmethod
     def resume(cls, path: str | Path, model: ImpedanceModel, group: str | None = None) -> Self:
-        """The predictor that `save` wrote, of the same model and group: what it predicts and learns is the same to the bit.
+        """The predictor that `save` wrote, of the same model and group; it predicts and learns the same, to the bit.
 
         Raises:
             OutputError: the file lacks, is damaged, or is of another model.
@@ -183,7 +190,7 @@ class OnlinePredictor:
     def _force(self, sample: Sample) -> Floats:
         force = np.empty(len(self._local.noise))
         try:
-            force[:] = sample.force  # type: ignore[assignment]
+            force[:] = sample.force
         except (TypeError, ValueError):
             force[:] = np.nan
         if not np.isfinite(force).all():

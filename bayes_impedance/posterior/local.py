@@ -118,7 +118,7 @@ class LocalConditioner:
             ]
 
     def _learned(self, cell: Cell, axis: int, inputs: Array, loading: Array, variance: Tensor) -> _Learned:
-        n = int(cell.count[axis])
+        n = int(cell.used[axis])
         one = np.ones(len(inputs))
         a, scale = whitened(self.local.numbers, self.local.noise[axis], axis, cell, inputs, one)
         scaled = torch.from_numpy(loading * scale[:, None])
@@ -168,11 +168,20 @@ class LocalConditioner:
         return location, variance, prior.shown.expand(shape), prior_variance
 
     def _of_cell(
-        self, learned: _Learned, axis: int, target: Features, rows: NDArray[np.int64], prior: Prior, latent: Latent
+        self,
+        learned: _Learned,
+        axis: int,
+        target: Features,
+        rows: NDArray[np.int64],
+        prior: Prior,
+        latent: Latent,
     ) -> tuple[Tensor, Tensor]:
         """Location and variance, without noise, that a cell gives some samples of an axis, `(m,)` each."""
         shape = target.inputs.shape[:-1]
-        location, own = prior.location.expand(shape)[axis, 0, rows], prior.own_variance.expand(shape)[axis, 0, rows]
+        location, own = (
+            prior.location.expand(shape)[axis, 0, rows],
+            prior.own_variance.expand(shape)[axis, 0, rows],
+        )
         cross = self.kernels[axis].cross_covariance(learned.inducing, target.inputs[axis, 0, rows], latent)
         a = torch.linalg.solve_triangular(learned.prior, cross, upper=False)
         v = torch.linalg.solve_triangular(learned.posterior, a, upper=False)

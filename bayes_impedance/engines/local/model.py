@@ -126,12 +126,12 @@ class LocalModel:
             if cell is None:
                 continue
             sums = self.sums[code]
-            count, posterior, d = learn(
+            used, posterior, d = learn(
                 self.numbers, self.noise, self.settings.novelty, cell, sums, x, prior[:, 0], residual
             )
             if sums.stale[0] >= self.refresh_every:
-                posterior, d = refresh(count, sums, self._keep(int(sums.stale[0])))
-            changed[code] = Cell(count, cell.inputs, cell.prior, posterior, d)
+                posterior, d = refresh(used, sums, self._keep(int(sums.stale[0])))
+            changed[code] = Cell(used, cell.inputs, cell.prior, posterior, d)
         # At once, so that a snapshot has a sample in all of its cells or in none.
         self.cells.update(changed)
         return Coverage.LEARNED if changed else Coverage.UNVISITED
@@ -170,7 +170,7 @@ class LocalModel:
                 sums.gram[axis] += white.T @ white
                 sums.moment[axis] += white.T @ scaled
         sums.samples[0] += n
-        posterior, d = refresh(cell.count, sums, 1.0)
+        posterior, d = refresh(cell.used, sums, 1.0)
         return cell._replace(posterior=posterior, d=d)
 
     def _visit(self, code: int, learning: Iterable[int] = ()) -> Cell | None:
@@ -180,7 +180,10 @@ class LocalModel:
         """
         if code in self.cells:
             return self.cells[code]
-        if code < 0 or len(self.cells) + sum(one not in self.cells for one in learning) >= self.settings.cells:
+        if (
+            code < 0
+            or len(self.cells) + sum(one not in self.cells for one in learning) >= self.settings.cells
+        ):
             return None
         axes, inducing = self.noise.size, self.settings.inducing
         self.sums[code] = Sums.empty(axes, inducing)
@@ -205,7 +208,9 @@ def mixture(weights: Floats, means: Floats, variances_: Floats) -> tuple[Floats,
 
 
 @njit(cache=True, nogil=True)
-def _prepare(numbers: KernelNumbers, grid: Grid, x: Floats, active: int) -> tuple[Floats, Integers, Floats, bool]:
+def _prepare(
+    numbers: KernelNumbers, grid: Grid, x: Floats, active: int
+) -> tuple[Floats, Integers, Floats, bool]:
     """Prior variances, and nearest cells with their weights."""
     codes, weights = np.full(active, -1), np.zeros(active)
     inside = nearest(grid, x[0], codes, weights)

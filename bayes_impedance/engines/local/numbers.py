@@ -123,9 +123,7 @@ def _summands(kernel: Kernel | None) -> list[Any]:
 def _columns_of(kernel: StationaryKernel, width: int) -> Sequence[int]:
     if not kernel.num_dims:
         return ()
-    columns: list[int] = (
-        list(range(width)) if kernel.active_dims is None else kernel.active_dims.tolist()
-    )
+    columns: list[int] = list(range(width)) if kernel.active_dims is None else kernel.active_dims.tolist()
     return columns
 
 
