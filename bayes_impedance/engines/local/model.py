@@ -143,7 +143,8 @@ class LocalModel:
         this is what `learn` comes to sample by sample.
         """
         codes, _ = weights_of(self.grid, inputs[0], self.settings.active)
-        for code in np.unique(codes[codes >= 0]).tolist():
+        # In the order of their first visit, as a stream comes to them: there may be more than `settings.cells`.
+        for code in dict.fromkeys(codes[codes >= 0].tolist()):
             rows = np.flatnonzero((codes == code).any(axis=1))
             cell = self._visit(code)
             if cell is not None:
