@@ -126,11 +126,13 @@ class LocalModel:
             if cell is None:
                 continue
             sums = self.sums[code]
+            if sums.stale[0] >= self.refresh_every:
+                # Before the sample is learned, which nothing is forgotten of yet.
+                posterior, d = refresh(cell.used, sums, self._keep(int(sums.stale[0])))
+                cell = cell._replace(posterior=posterior, d=d)
             used, posterior, d = learn(
                 self.numbers, self.noise, self.settings.novelty, cell, sums, x, prior[:, 0], residual
             )
-            if sums.stale[0] >= self.refresh_every:
-                posterior, d = refresh(used, sums, self._keep(int(sums.stale[0])))
             changed[code] = Cell(used, cell.inputs, cell.prior, posterior, d)
         # At once, so that a snapshot has a sample in all of its cells or in none.
         self.cells.update(changed)
@@ -191,7 +193,7 @@ class LocalModel:
         return empty_cell(axes, inducing, self.width)
 
     def _keep(self, samples: int) -> float:
-        """Weight of what a cell was taught before the last `samples`."""
+        """Weight that what a cell was taught keeps after so many more `samples`; it is forgotten in such steps."""
         memory = self.settings.forgetting
         return 1.0 if memory is None else float(np.exp(-samples / memory))
 
