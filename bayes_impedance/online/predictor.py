@@ -15,7 +15,7 @@ from bayes_impedance.engines.local.model import Coverage, LocalModel, Snapshot
 from bayes_impedance.errors import ConfigurationError, LogError
 from bayes_impedance.features import FeatureMap
 from bayes_impedance.model import ImpedanceModel
-from bayes_impedance.online.inputs import SampleInputs
+from bayes_impedance.online.inputs import SampleInputs, fill, is_usable
 from bayes_impedance.online.sample import Sample
 from bayes_impedance.online.storage import read_state, write_state
 from bayes_impedance.training import observations
@@ -139,15 +139,16 @@ class OnlinePredictor:
             LogError: it lacks something or is not finite, or is not later than the last; nothing is learned then.
         """
         inputs, _ = self._inputs(sample)
-        force = self._force(sample)
+        force, time = self._force(sample), _time(sample)
         with self._lock:
-            if not sample.time > self._last:
+            # Nothing is later than an infinite time, and no time than NaN.
+            if not self._last < time < np.inf:
                 raise LogError(
                     f"sample at {sample.time} s: expected one later than the last, at {self._last} s; leave it out, or "
                     "begin a new predictor for another recording"
                 )
             coverage = self._local.learn(inputs, force - prior_force(self._local, inputs))
-            self._last = sample.time
+            self._last = time
             self.samples += coverage is Coverage.LEARNED
         return coverage
 
@@ -189,16 +190,19 @@ class OnlinePredictor:
 
     def _force(self, sample: Sample) -> Floats:
         force = np.empty(len(self._local.noise))
-        try:
-            force[:] = sample.force
-        except (TypeError, ValueError):
-            force[:] = np.nan
-        if not np.isfinite(force).all():
+        if not fill(force, sample.force) or not is_usable(force):
             raise LogError(
                 f"sample at {sample.time} s: expected a finite force for each axis to learn from, got "
                 f"{sample.force!r}; predict it, and leave it out of what is learned"
             )
         return force
+
+
+def _time(sample: Sample) -> float:
+    try:
+        return float(sample.time)
+    except (TypeError, ValueError):
+        return float("nan")
 
 
 def prior_force(known: LocalModel | Snapshot, inputs: Floats) -> Floats:
