@@ -23,7 +23,15 @@ from bayes_impedance.priors import build_force_model
 
 BATCH = torch.Size([2, 1])
 SMOOTH = ("squared_exponential", "rational_quadratic", "matern52", "matern72", "matern92")
-ALL = ("squared_exponential", "rational_quadratic", "matern12", "matern32", "matern52", "matern72", "matern92")
+ALL = (
+    "squared_exponential",
+    "rational_quadratic",
+    "matern12",
+    "matern32",
+    "matern52",
+    "matern72",
+    "matern92",
+)
 
 
 def assert_equal(problem, one, two, relative=1e-9):
@@ -213,7 +221,8 @@ def test_a_covariance_that_is_not_stationary_is_refused():
     problem = Problem.of("phase")
     linear = gpytorch.kernels.LinearKernel(batch_shape=BATCH).double()
     with pytest.raises(
-        ConfigurationError, match="expected stationary covariances with local, got LinearKernel; set engine.name=dense"
+        ConfigurationError,
+        match="expected stationary covariances with local, got LinearKernel; set engine.name=dense",
     ):
         custom(problem, linear)
     process = ImpedanceProcess(gpytorch.kernels.ConstantKernel(batch_shape=BATCH), batch_shape=BATCH)
@@ -227,7 +236,8 @@ def test_a_covariance_that_is_not_stationary_is_refused():
 
 def test_coupled_axes_and_noise_of_the_motion_are_refused():
     with pytest.raises(
-        ConfigurationError, match="expected model.axes: independent and an impedance model with local, got Coupled"
+        ConfigurationError,
+        match="expected model.axes: independent and an impedance model with local, got Coupled",
     ):
         Problem.of("coupled")
     config = load_config("phase", ["model.position_noise_sd=0.0001"])
