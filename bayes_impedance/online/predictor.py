@@ -112,6 +112,8 @@ class OnlinePredictor:
         features = feature_map(own, mean, observed=True)
         visited = features.inputs[:, 0].numpy()
         self._local = build_local(force_model, feature_map, model.config.engine.local, visited[0])
+        # Which takes a minute where nothing was compiled yet: no loop must wait for it.
+        self._local.compile(np.ascontiguousarray(visited[:, 0]))
         self._lock = threading.Lock()
         self._last = -np.inf
         #: Samples that were learned, those of the training log included.

@@ -152,6 +152,14 @@ class LocalModel:
             if cell is not None:
                 self.cells[code] = self._taught(cell, self.sums[code], inputs[:, rows], residual[:, rows])
 
+    def compile(self, x: Floats) -> None:
+        """Compile all that a loop calls, at inputs `x` `(axes, D)` within the grid; nothing is learned."""
+        scratch = replace(self, cells={}, sums={})
+        scratch.learn(x, np.zeros(len(x)))
+        scratch.view.predict(x)
+        for code, cell in scratch.cells.items():
+            refresh(cell.used, scratch.sums[code], 1.0)
+
     @property
     def refresh_every(self) -> int:
         """Samples after which the factor of a cell is computed anew."""
