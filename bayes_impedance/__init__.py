@@ -17,7 +17,8 @@ Two levels:
 - High: `inspect_recordings` says what is in files and what looks wrong; `read_log` and `load_config` take in data and
   choices; `ImpedanceModel` fits, gives a `Posterior` of every `Latent` and a `Verdict` on every impedance; `evaluate`
   scores it on another log, `cross_validate` on parts of its own; `prior_sensitivity` tells what rests on a prior;
-  `save_model` and `load_model` keep it; `OnlinePredictor` learns and predicts every `Sample` of a control loop. Each failure that input can cause is a `BayesImpedanceError`.
+  `save_model` and `load_model` keep it; `OnlinePredictor` learns and predicts every `Sample` of a control loop. Each
+  failure that input can cause is a `BayesImpedanceError`.
 - Under it: `bayes_impedance.kernels` are ordinary gpytorch kernels (`ImpedanceKernel`, `PDKernel`,
   `InteractionKernel`) for models of one's own; `bayes_impedance.engines` computes exact likelihoods
   with them, and given impedance by engines whose cost grows with the length of the log;

@@ -18,7 +18,7 @@ from bayes_impedance.identifiability import OffDiagonal, Support, Verdict, cavea
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.posterior import Posterior
-from bayes_impedance.posterior.compute import Progress as InferenceHook
+from bayes_impedance.posterior.batches import Progress as InferenceHook
 from bayes_impedance.priors import Entry
 from bayes_impedance.sampling.drawn import DrawnPosterior
 from bayes_impedance.sampling.sample import Hook as SamplingHook

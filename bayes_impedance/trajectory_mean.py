@@ -23,6 +23,24 @@ SPLINE_DEGREE = 5  # so that the second derivative of the average is itself smoo
 
 
 @dataclass(frozen=True)
+class Instant:
+    """Motion at one instant of a stream; fields as those of `PreparedTrial`, of one sample."""
+
+    name: str
+    group: str
+    source: str
+    position: Array
+    velocity: Array
+    acceleration: Array
+    phase: Array | None
+    phase_velocity: Array | None
+    phase_acceleration: Array | None
+    reference: Array | None
+    reference_velocity: Array | None
+    reference_acceleration: Array | None
+
+
+@dataclass(frozen=True)
 class TrajectoryMean:
     """μ_xd as learned from training trials; call `derivatives` for any trial of a known group."""
 
@@ -48,7 +66,7 @@ class TrajectoryMean:
                 constants[group] = _constant(prior, log.axes, trials)
         return cls(prior, averages, constants)
 
-    def derivatives(self, trial: PreparedTrial) -> Array:
+    def derivatives(self, trial: PreparedTrial | Instant) -> Array:
         """μ_xd, dμ_xd/dt, d²μ_xd/dt² at each sample, `(3, n, axes)` [m, m/s, m/s²].
 
         Raises:
@@ -72,7 +90,7 @@ class TrajectoryMean:
             return result
         return self._trial_average(trial)
 
-    def _reference(self, trial: PreparedTrial) -> Array:
+    def _reference(self, trial: PreparedTrial | Instant) -> Array:
         parts = (trial.reference, trial.reference_velocity, trial.reference_acceleration)
         if any(part is None for part in parts):
             raise LogError(
@@ -82,7 +100,7 @@ class TrajectoryMean:
             )
         return np.stack([part for part in parts if part is not None])
 
-    def _trial_average(self, trial: PreparedTrial) -> Array:
+    def _trial_average(self, trial: PreparedTrial | Instant) -> Array:
         # One function of phase, with the sample's own φ̇ and φ̈: μ'φ̇ and μ''φ̇² + μ'φ̈.
         phase, rate, change = phase_derivatives(trial)
         spline = self.averages[trial.group]
@@ -92,7 +110,7 @@ class TrajectoryMean:
         )
 
 
-def phase_derivatives(trial: PreparedTrial) -> tuple[Array, Array, Array]:
+def phase_derivatives(trial: PreparedTrial | Instant) -> tuple[Array, Array, Array]:
     """φ, φ̇ and φ̈ of a trial, `(n,)` each [1, 1/s, 1/s²].
 
     Raises:

@@ -21,6 +21,7 @@ from benchmarks.ledger import Ledger
 from benchmarks.paper_protocol import IMPEDANCE, KNOWN, NAIVE, UNREADABLE, Reuse, settings
 from benchmarks.real_folds import LEARNED, RESTARTS, TASKS, TWELVE, compared, held_out, learned, reused
 from benchmarks.results import Results, commit, committed
+from benchmarks.sparse_curves import sparse, stream
 
 # --- synthetic subjects --------------------------------------------------------------------------
 
@@ -75,6 +76,22 @@ def subjects(ledger: Ledger) -> Results:
     }
 
 
+# --- local sparse models ---------------------------------------------------------------------------
+
+
+def local_models(ledger: Ledger) -> Results:
+    """Every subject without perturbation: over inducing inputs and width of cells, and learning as samples come."""
+    return {name: ledger.run(f"local {name}", partial(local_subject, name)) for name in SUBJECTS}
+
+
+def local_subject(name: str) -> Results:
+    """Eight repetitions given, the last two predicted; and one after another."""
+    log = repetitions_of(name, "unperturbed")
+    reuse = Reuse.trained(subject_configuration(), log.select([0]))
+    given, last = log.select(range(REPETITIONS - 2)), log.select([REPETITIONS - 2, REPETITIONS - 1])
+    return {"sparse": sparse(reuse, given, last), "stream": stream(reuse, log)}
+
+
 # --- real recordings -----------------------------------------------------------------------------
 
 #: Restarts of the naive GP in a second round: whether figures are those of an accidental optimum.
@@ -116,7 +133,11 @@ def _joined(folds: list[Results], scores: list[list[Results]]) -> list[Results]:
 
 # --- all -----------------------------------------------------------------------------------------
 
-PARTS: Mapping[str, Callable[[Ledger], Results]] = {"subjects": subjects, "recordings": recordings}
+PARTS: Mapping[str, Callable[[Ledger], Results]] = {
+    "subjects": subjects,
+    "local": local_models,
+    "recordings": recordings,
+}
 
 
 def main() -> None:

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 
-from bayes_impedance import ImpedanceModel, OnlinePredictor, Sample
-from bayes_impedance.config import override_config
+from bayes_impedance import OnlinePredictor, Sample
 from bayes_impedance.evaluation.contenders import Predictor
 from bayes_impedance.evaluation.metrics import score
 from bayes_impedance.preprocessing import PreparedLog
-from benchmarks.ledger import Ledger
 from benchmarks.paper_protocol import IMPEDANCE, NAIVE, Reuse, scores_of
 from benchmarks.results import Results
 
@@ -53,9 +49,7 @@ def stream(reuse: Reuse, log: PreparedLog) -> Results:
     learning, frozen = (OnlinePredictor(model) for _ in range(2))
     given = first.trials[0].force
     assert given is not None
-    msll: dict[str, dict[str, list[float]]] = {
-        axis: {"learning": [], "frozen": []} for axis in log.axes
-    }
+    msll: dict[str, dict[str, list[float]]] = {axis: {"learning": [], "frozen": []} for axis in log.axes}
     for number, trial in enumerate(log.trials[1:], start=1):
         found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {"learning": [], "frozen": []}
         assert trial.force is not None

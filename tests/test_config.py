@@ -298,7 +298,7 @@ def test_override_that_is_no_yaml():
         ("engine.jitter=0.1", r"less than or equal to 0\.001\), got 0\.1"),
         ("engine.max_samples=1", r"greater than or equal to 2\), got 1"),
         ("engine.name=kalman", r"got 'kalman'"),
-        ("engine.name=markov", r"expected auto or dense with impedance: moments, got markov"),
+        ("engine.name=markov", r"expected auto, dense or local with impedance: moments, got markov"),
         ("model.desired_trajectory.periodic=true", r"periodic: expected trajectory_input: phase with it"),
         ("preprocessing.rate=0", r"greater than 0\), got 0"),
         ("preprocessing.rate=.nan", r"finite number\), got nan"),

@@ -22,10 +22,10 @@ class LocalConfig(Section):
     """Local sparse models on a grid of cells, for streams and long logs.
 
     Each sample belongs to the `active` nearest cells. A cell keeps at most `inducing` inputs, and a sample becomes one
-    of them where what the others leave of its force exceeds `novelty` times the noise variance. `width` of a cell by component, in
-    the component's unit: those of θ, each a length scale of the desired trajectory wide, if null. The grid reaches one
-    cell beyond the motion that the model was trained on, with at most `cells` of them in use. `forgetting`: samples of
-    a cell after which one weighs 1/e; null keeps all.
+    of them where what the others leave of its force exceeds `novelty` times the noise variance. `width` of a cell by
+    component, in the component's unit; null: every component of θ, a length scale of the desired trajectory wide. The
+    grid reaches one cell beyond the motion that the model was trained on, with at most `cells` of them in use.
+    `forgetting`: samples of a cell after which one weighs 1/e; null keeps all.
     """
 
     inducing: int = Field(default=50, ge=2, le=2000)
@@ -39,10 +39,11 @@ class LocalConfig(Section):
 class EngineConfig(Section):
     """How the likelihood of the forces is computed.
 
-    `impedance: moments` integrates stiffness, damping and mass out to second order, which the dense engine does, and for
-    posteriors of long logs `local` does by local sparse models of the same covariance; training is dense in both. `map` estimates them as functions, with a Laplace covariance, from the likelihood given impedance, which every
-    engine computes. `inducing` inputs carry each such function. `max_samples` and `jitter`, relative to the mean prior
-    variance of force, are of the dense engine.
+    `impedance: moments` integrates stiffness, damping and mass out to second order, which the dense engine does; for
+    posteriors of long logs `local` does it by local sparse models of the same covariance, and training stays dense.
+    `map` estimates them as functions, with a Laplace covariance, from the likelihood given impedance, which every
+    engine but `local` computes. `inducing` inputs carry each such function. `max_samples` and `jitter`, relative to the
+    mean prior variance of force, are of the dense engine.
     """
 
     name: EngineName = "auto"
@@ -56,8 +57,8 @@ class EngineConfig(Section):
     def _check(self) -> Self:
         if self.impedance == "moments" and self.name in ("markov", "lowrank"):
             raise ValueError(
-                f"name: expected auto or dense with impedance: moments, got {self.name}, which computes the likelihood "
-                "given impedance; set engine.impedance=map"
+                f"name: expected auto, dense or local with impedance: moments, got {self.name}, which computes the "
+                "likelihood given impedance; set engine.impedance=map"
             )
         if self.impedance == "map" and self.name == "local":
             raise ValueError(

@@ -1,4 +1,4 @@
-"""Inside a control loop: a model that learns every sample and predicts the next force in a fraction of a millisecond."""
+"""Inside a control loop: a model that learns every sample and predicts the next force within a millisecond."""
 
 from bayes_impedance.online.predictor import OnlinePredictor as OnlinePredictor
 from bayes_impedance.online.predictor import Prediction as Prediction

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from bayes_impedance.errors import ConfigurationError, LogError
 from bayes_impedance.features import FeatureMap
 from bayes_impedance.online.sample import Sample
-from bayes_impedance.trajectory_mean import TrajectoryMean
+from bayes_impedance.trajectory_mean import Instant, TrajectoryMean
 
 Floats = NDArray[np.float64]
 
@@ -21,27 +20,28 @@ DERIVATIVES = {
     "velocity": ("velocity", "acceleration", "jerk"),
     "phase": ("phase", "phase_velocity", "phase_acceleration"),
 }
+#: What no measurement reaches. One infinite covariance would never leave the sums of a cell again.
+LARGEST = 1e30
 BY_AXIS = ("position", "velocity", "acceleration", "jerk")
 #: What the mean of the desired trajectory is made of.
 REFERENCE = ("reference", "reference_velocity", "reference_acceleration")
 
 
-@dataclass(frozen=True)
-class _Instant:
-    """A sample as the mean of the desired trajectory sees a trial: arrays of one row."""
+def fill(place: Floats, value: object) -> bool:
+    """Put numbers into `place`; False where they are none, or not as many: one number is not spread over axes."""
+    try:
+        found = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return False
+    if found.size != place.size or found.ndim > 1:
+        return False
+    place[:] = found
+    return True
 
-    name: str
-    group: str
-    source: str
-    position: Floats
-    velocity: Floats
-    acceleration: Floats
-    phase: Floats | None
-    phase_velocity: Floats | None
-    phase_acceleration: Floats | None
-    reference: Floats | None
-    reference_velocity: Floats | None
-    reference_acceleration: Floats | None
+
+def is_usable(values: Floats) -> bool:
+    """Whether these are finite, and their fourth powers, too, of which covariances are made."""
+    return bool(np.abs(values).max(initial=0.0) < LARGEST)
 
 
 class SampleInputs:
@@ -87,9 +87,10 @@ class SampleInputs:
             needed.add("acceleration")
         kind = feature_map.model.desired_trajectory.mean
         needed |= set(DERIVATIVES["phase"]) if kind == "trial_average" else set()
-        #: Fields that a sample must have.
-        self.needed = tuple(name for name in Sample._fields if name in needed)
+        self._filled = tuple(name for name in Sample._fields if name in needed)
         self._references = REFERENCE if kind == "reference" else ()
+        #: Fields that a sample must have.
+        self.needed = (*self._filled, *self._references)
         self._follows_hand = kind == "equilibrium"
 
     def __call__(self, sample: Sample) -> tuple[Floats, Floats]:
@@ -99,10 +100,9 @@ class SampleInputs:
             LogError: a field lacks, is of another shape, or is not finite.
         """
         values = np.zeros(self._size)
-        for name in self.needed:
+        for name in self._filled:
             self._fill(values[self._starts[name]], sample, name)
-        # One sum finds what is not finite in any of them.
-        if not np.isfinite(values.sum()):
+        if not is_usable(values):
             self._refuse(sample, values)
         axes = len(self._map.axes)
         inputs = np.empty((axes, self._index.size))
@@ -121,19 +121,21 @@ class SampleInputs:
             raise LogError(
                 f"sample at {sample.time} s: expected {name}, which this configuration asks for, found none; give it"
             )
-        try:
-            place[:] = value
-        except (TypeError, ValueError) as error:
+        if not fill(place, value):
+            whole = (
+                f"{place.size} numbers ({', '.join(self._map.axes)})"
+                if name not in DERIVATIVES["phase"]
+                else "one"
+            )
             raise LogError(
-                f"sample at {sample.time} s: expected {name} of {place.size} numbers "
-                f"({', '.join(self._map.axes)}), got {value!r}; give one for each"
-            ) from error
+                f"sample at {sample.time} s: expected {name} of {whole}, got {value!r}; give one for each"
+            )
 
     def _refuse(self, sample: Sample, values: Floats) -> None:
-        for name in self.needed:
-            if not np.isfinite(values[self._starts[name]]).all():
+        for name in self._filled:
+            if not is_usable(values[self._starts[name]]):
                 raise LogError(
-                    f"sample at {sample.time} s: expected finite numbers, found {name} "
+                    f"sample at {sample.time} s: expected finite numbers below {LARGEST:g}, found {name} "
                     f"{values[self._starts[name]].tolist()}; leave the sample out"
                 )
 
@@ -144,13 +146,14 @@ class SampleInputs:
             if own[name] is not None:
                 self._fill(own[name][0], sample, name)
         for name in DERIVATIVES["phase"]:
-            own[name] = values[self._starts[name]] if name in self.needed else None
+            own[name] = values[self._starts[name]] if name in self._filled else None
         motion = dict(zip(("position", "velocity", "acceleration"), hand.T[:, None], strict=True))
-        instant = _Instant(name="stream", group=self._group, source="sample", **motion, **own)
+        instant = Instant(name="stream", group=self._group, source="sample", **motion, **own)
         desired = self._mean.derivatives(instant)[:, 0].T
-        if not np.isfinite(desired).all():
+        if not is_usable(desired):
             raise LogError(
-                f"sample at {sample.time} s: expected a finite reference, found {desired.tolist()}; leave the sample out"
+                f"sample at {sample.time} s: expected a finite reference below {LARGEST:g}, found "
+                f"{desired.tolist()}; leave the sample out"
             )
         return desired
 

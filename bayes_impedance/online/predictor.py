@@ -15,7 +15,7 @@ from bayes_impedance.engines.local.model import Coverage, LocalModel, Snapshot
 from bayes_impedance.errors import ConfigurationError, LogError
 from bayes_impedance.features import FeatureMap
 from bayes_impedance.model import ImpedanceModel
-from bayes_impedance.online.inputs import SampleInputs
+from bayes_impedance.online.inputs import SampleInputs, fill, is_usable
 from bayes_impedance.online.sample import Sample
 from bayes_impedance.online.storage import read_state, write_state
 from bayes_impedance.training import observations
@@ -81,7 +81,8 @@ class OnlinePredictor:
         >>> log = draw_force(model.config, repeated_motion(repetitions=1, duration=2.0, rate=10.0), seed=0)
         >>> predictor = OnlinePredictor(model.fit(log))
         >>> trial = log.trials[0]
-        >>> one = Sample(9.0, trial.position[3], trial.velocity[3], trial.force[3], trial.acceleration[3], trial.jerk[3])
+        >>> motion = trial.position[3], trial.velocity[3]
+        >>> one = Sample(9.0, *motion, trial.force[3], trial.acceleration[3], trial.jerk[3])
         >>> predictor.update(one).name, predictor.samples
         ('LEARNED', 21)
         >>> predictor.predict(one).force.shape
@@ -95,10 +96,10 @@ class OnlinePredictor:
         log = model.fitted.log
         if model.config.engine.impedance == "map":
             raise ConfigurationError(
-                "engine.impedance: expected moments to predict online, got map, whose functions are found anew from all "
-                "samples; train with engine.impedance=moments"
+                "engine.impedance: expected moments to predict online, got map, whose functions are found anew from "
+                "all samples; train with engine.impedance=moments"
             )
-        if group is None and len(log.groups) > 1 or group is not None and group not in log.groups:
+        if group not in log.groups and (group is not None or len(log.groups) > 1):
             raise ConfigurationError(
                 f"group: expected one of {', '.join(log.groups)}, got {group}; name the one that holds the handle"
             )
@@ -111,6 +112,8 @@ class OnlinePredictor:
         features = feature_map(own, mean, observed=True)
         visited = features.inputs[:, 0].numpy()
         self._local = build_local(force_model, feature_map, model.config.engine.local, visited[0])
+        # Which takes a minute where nothing was compiled yet: no loop must wait for it.
+        self._local.compile(np.ascontiguousarray(visited[:, 0]))
         self._lock = threading.Lock()
         self._last = -np.inf
         #: Samples that were learned, those of the training log included.
@@ -138,15 +141,16 @@ class OnlinePredictor:
             LogError: it lacks something or is not finite, or is not later than the last; nothing is learned then.
         """
         inputs, _ = self._inputs(sample)
-        force = self._force(sample)
+        force, time = self._force(sample), _time(sample)
         with self._lock:
-            if not sample.time > self._last:
+            # Nothing is later than an infinite time, and no time than NaN.
+            if not self._last < time < np.inf:
                 raise LogError(
                     f"sample at {sample.time} s: expected one later than the last, at {self._last} s; leave it out, or "
                     "begin a new predictor for another recording"
                 )
             coverage = self._local.learn(inputs, force - prior_force(self._local, inputs))
-            self._last = sample.time
+            self._last = time
             self.samples += coverage is Coverage.LEARNED
         return coverage
 
@@ -170,7 +174,7 @@ class OnlinePredictor:
 
     @classmethod
     def resume(cls, path: str | Path, model: ImpedanceModel, group: str | None = None) -> Self:
-        """The predictor that `save` wrote, of the same model and group: what it predicts and learns is the same to the bit.
+        """The predictor that `save` wrote, of the same model and group; it predicts and learns the same, to the bit.
 
         Raises:
             OutputError: the file lacks, is damaged, or is of another model.
@@ -188,16 +192,19 @@ class OnlinePredictor:
 
     def _force(self, sample: Sample) -> Floats:
         force = np.empty(len(self._local.noise))
-        try:
-            force[:] = sample.force  # type: ignore[assignment]
-        except (TypeError, ValueError):
-            force[:] = np.nan
-        if not np.isfinite(force).all():
+        if not fill(force, sample.force) or not is_usable(force):
             raise LogError(
                 f"sample at {sample.time} s: expected a finite force for each axis to learn from, got "
                 f"{sample.force!r}; predict it, and leave it out of what is learned"
             )
         return force
+
+
+def _time(sample: Sample) -> float:
+    try:
+        return float(sample.time)
+    except (TypeError, ValueError):
+        return float("nan")
 
 
 def prior_force(known: LocalModel | Snapshot, inputs: Floats) -> Floats:

@@ -45,7 +45,7 @@ def infer_local(
     latents: Sequence[Latent] | None = None,
     progress: Progress | None = None,
 ) -> Posterior:
-    """Posteriors at every sample of the log of `target`, given the forces of that of `given`; the prior where it is None.
+    """Posteriors at every sample of the log of `target`, given the forces of that of `given`; else the prior.
 
     Groups of `target` without a namesake in `given` keep their prior, and so do samples outside of the range of motion
     of `given`. Memory beyond logs and results is that of the cells of the groups at work.
@@ -125,7 +125,7 @@ class LocalConditioner:
             ]
 
     def _learned(self, cell: Cell, axis: int, inputs: Array, loading: Array, variance: Tensor) -> _Learned:
-        n = int(cell.count[axis])
+        n = int(cell.used[axis])
         one = np.ones(len(inputs))
         a, scale = whitened(self.local.numbers, self.local.noise[axis], axis, cell, inputs, one)
         scaled = torch.from_numpy(loading * scale[:, None])

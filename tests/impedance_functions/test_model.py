@@ -227,7 +227,7 @@ def test_plans_are_of_moments(fitted):
         ),
         (
             ("engine.name=markov", "engine.impedance=moments"),
-            r"engine: name: expected auto or dense with impedance: moments, got markov, which computes",
+            r"engine: name: expected auto, dense or local with impedance: moments, got markov, which computes",
         ),
     ],
 )

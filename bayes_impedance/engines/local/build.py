@@ -36,7 +36,8 @@ def build_local(
     with torch.no_grad():
         noise = model.noise_variance.expand(axes, 1, 1).reshape(axes).numpy().copy()
     widths = settings.width or _length_scales(model, feature_map)
-    columns, width = [], []
+    columns: list[int] = []
+    width: list[float] = []
     for component, value in widths.items():
         own = feature_map.columns_of(component)
         if not own:
@@ -46,14 +47,14 @@ def build_local(
                 "it, or name another"
             )
         columns += own
-        width += [value] * len(own) if np.ndim(value) == 0 else list(np.ravel(value))
-    return LocalModel(
-        numbers, noise, _grid(visited[:, columns], columns, np.array(width)), settings, feature_map.width
-    )
+        width += np.broadcast_to(value, len(own)).tolist()
+    grid = _grid(visited, np.array(columns), np.array(width))
+    return LocalModel(numbers, noise, grid, settings, feature_map.width)
 
 
-def _grid(visited: Floats, columns: list[int], width: Floats) -> Grid:
-    low, high = visited.min(axis=0), visited.max(axis=0)
+def _grid(visited: Floats, columns: NDArray[np.int64], width: Floats) -> Grid:
+    place = visited[:, columns]
+    low, high = place.min(axis=0), place.max(axis=0)
     inner = np.floor((high - low) / width) + 1.0
     # Centred: the first and the last place visited lie inside of a cell, not at its border.
     lower = 0.5 * (low + high) - (0.5 * inner + 1.0) * width
@@ -63,7 +64,7 @@ def _grid(visited: Floats, columns: list[int], width: Floats) -> Grid:
             f"engine.local.width: expected cells of which at most {MOST:g} cover the range of motion, got "
             f"{np.format_float_scientific(math.prod(cells.tolist()), 1)}; widen them"
         )
-    return Grid(np.array(columns), lower, width, cells.astype(np.int64))
+    return Grid(columns, lower, width, cells.astype(np.int64))
 
 
 def _length_scales(model: ForceModel, feature_map: FeatureMap) -> Mapping[str, Floats]:
@@ -71,7 +72,8 @@ def _length_scales(model: ForceModel, feature_map: FeatureMap) -> Mapping[str, F
     scales = model.kernel.impedance.trajectory.lengthscale.detach()
     size = len(feature_map.layout.theta)
     shortest = scales.expand(*scales.shape[:-1], size).reshape(-1, size).amin(0).numpy()
-    found, start = {}, 0
+    found: dict[str, Floats] = {}
+    start = 0
     for component in feature_map.theta:
         count = len(feature_map.columns_of(component))
         found[component] = shortest[start : start + count]

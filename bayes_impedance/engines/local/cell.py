@@ -37,13 +37,13 @@ LEAST_NOVELTY = 1e-10
 
 
 class Cell(NamedTuple):
-    """What predictions are made of; nobody changes what a cell holds in its first `count` rows.
+    """What predictions are made of; nobody changes what a cell holds in its first `used` rows.
 
-    `count` (axes,): inducing inputs in use. `inputs` `(axes, D, B)`; `prior` L `(axes, B, B)`; `posterior` U with
+    `used` `(axes,)`: inducing inputs in use. `inputs` `(axes, D, B)`; `prior` L `(axes, B, B)`; `posterior` U with
     UᵀU = A `(axes, B, B)`; `d` U⁻ᵀ Σ a r/(σ² + δ) `(axes, B)`, so that E[w] = U⁻¹ d.
     """
 
-    count: Integers
+    used: Integers
     inputs: Floats
     prior: Floats
     posterior: Floats
@@ -96,20 +96,20 @@ def learn(
     own: Floats,
     residual: Floats,
 ) -> tuple[Integers, Floats, Floats]:
-    """Teach a cell one sample: its new `count`, `posterior` and `d`.
+    """Teach a cell one sample: its new `used`, `posterior` and `d`.
 
     Inputs `x` `(axes, D)`, prior variance of their force `own` `(axes,)` [N²], u − E[u] `residual` `(axes,)` [N].
 
     What readers of the old cell see stays: new arrays come back, and `inputs` and `prior` gain rows that only the new
-    count reaches. `noise` σ_r² `(axes,)` [N²]. An input becomes an inducing one where the others
-    leave more than `novelty` times the noise of its variance, and there is room.
+    `used` reaches. `noise` σ_r² `(axes,)` [N²]. An input becomes an inducing one where the others leave more than
+    `novelty` times the noise of its variance, and there is room.
     """
     axes, most = cell.d.shape
-    count = cell.count.copy()
+    used = cell.used.copy()
     posterior, d = cell.posterior.copy(), cell.d.copy()
     a = np.empty((1, most))
     for axis in range(axes):
-        n = count[axis]
+        n = used[axis]
         covariances(numbers, axis, cell.inputs[axis, :, :n], x[axis], a[:, :n])
         solve(cell.prior[axis], n, a[0])
         left = max(own[axis] - squared_norm(a[0], n), 0.0)
@@ -121,7 +121,7 @@ def learn(
             a[0, n] = cell.prior[axis, n, n]
             left = 0.0
             n += 1
-            count[axis] = n
+            used[axis] = n
         scale = np.sqrt(noise[axis] + left)
         for k in range(n):
             a[0, k] /= scale
@@ -133,20 +133,20 @@ def learn(
         rotate(posterior[axis], n, d[axis], a[0], y)
     sums.samples[0] += 1
     sums.stale[0] += 1
-    return count, posterior, d
+    return used, posterior, d
 
 
 @njit(cache=True, nogil=True)
-def refresh(count: Integers, sums: Sums, keep: float) -> tuple[Floats, Floats]:
+def refresh(used: Integers, sums: Sums, keep: float) -> tuple[Floats, Floats]:
     """`posterior` and `d` from the sums, after what these hold has been given the weight `keep`."""
     posterior, d = np.zeros_like(sums.gram), np.zeros_like(sums.moment)
     if keep != 1.0:
         sums.gram[:] *= keep
         sums.moment[:] *= keep
-    for axis in range(count.size):
-        factorise(sums.gram[axis], count[axis], posterior[axis])
+    for axis in range(used.size):
+        factorise(sums.gram[axis], used[axis], posterior[axis])
         d[axis] = sums.moment[axis]
-        solve_transposed(posterior[axis], count[axis], d[axis])
+        solve_transposed(posterior[axis], used[axis], d[axis])
     sums.stale[0] = 0
     return posterior, d
 
@@ -162,7 +162,7 @@ def moments(
     axes, most = cell.d.shape
     a = np.empty((3, most))
     for axis in range(axes):
-        n = cell.count[axis]
+        n = cell.used[axis]
         covariances(numbers, axis, cell.inputs[axis, :, :n], x[axis], a[:, :n])
         for quantity in range(3):
             solve(cell.prior[axis], n, a[quantity])
@@ -221,7 +221,7 @@ def place(numbers: KernelNumbers, axis: int, cell: Cell, inputs: Floats) -> None
         cell.prior[axis, n, :n] = row[0, :n]
         cell.prior[axis, n, n] = np.sqrt(max(own[0] - squared_norm(row[0], n), LEAST_NOVELTY * own[0]))
         cell.posterior[axis, n, n] = 1.0
-    cell.count[axis] = inputs.shape[0]
+    cell.used[axis] = inputs.shape[0]
 
 
 @njit(cache=True, nogil=True)
@@ -229,7 +229,7 @@ def whitened(
     numbers: KernelNumbers, noise: float, axis: int, cell: Cell, inputs: Floats, residual: Floats
 ) -> tuple[Floats, Floats]:
     """a/√(σ² + δ) `(n, B)` and r/√(σ² + δ) `(n,)` of many samples: what `learn` adds to the sums, one by one."""
-    n = cell.count[axis]
+    n = cell.used[axis]
     own, row = np.empty(3), np.empty((1, cell.d.shape[1]))
     white = np.zeros((inputs.shape[0], cell.d.shape[1]))
     scaled = np.empty(inputs.shape[0])

@@ -40,13 +40,12 @@ class Grid(NamedTuple):
 def nearest(grid: Grid, x: Floats, codes: Integers, weights: Floats) -> bool:
     """The nearest cells to a sample `x` `(D,)`, as many as `codes` holds, nearest first, and their weights.
 
-    g = exp(−r²/2b²) with r the distance to the centre in cells, not yet normalised; codes behind the last cell there is
-    are −1. False where the sample lies outside of the grid.
+    g = exp(−r²/2b²) with r the distance to the centre in cells, not yet normalised. At a border there are fewer, for
+    they are looked for near by; codes behind the last are −1. False where the sample lies outside of the grid.
     """
     p = grid.columns.size
     index = np.empty(p, dtype=np.int64)
     offset = np.empty(p)
-    squared = 0.0
     for c in range(p):
         place = (x[grid.columns[c]] - grid.lower[c]) / grid.width[c]
         # NaN is outside, too
@@ -54,24 +53,26 @@ def nearest(grid: Grid, x: Floats, codes: Integers, weights: Floats) -> bool:
             return False
         index[c] = int(place)
         offset[c] = place - index[c] - 0.5
-        squared += offset[c] ** 2
     # Neighbours in the direction whose border is nearest cost least.
     order = np.argsort(-np.abs(offset))
     few = min(p, DIRECTIONS)
+    # Nine cells reach so far where there are few directions to take.
+    reach = 4 if p == 1 else 2 if p == 2 else 1
+    steps = 2 * reach + 1
     found = 0
     most = codes.size
     distance = np.full(most, np.inf)
     codes[:] = OUTSIDE
     step = np.zeros(p, dtype=np.int64)
-    for combination in range(3**few + 2 * (p - few)):
+    for combination in range(steps**few + 2 * (p - few)):
         step[:] = 0
         rest = combination
-        if combination < 3**few:
+        if combination < steps**few:
             for c in range(few):
-                step[order[c]] = rest % 3 - 1
-                rest //= 3
+                step[order[c]] = rest % steps - reach
+                rest //= steps
         else:
-            rest = combination - 3**few
+            rest = combination - steps**few
             step[order[few + rest // 2]] = 2 * (rest % 2) - 1
         code, r = 0, 0.0
         inside = True

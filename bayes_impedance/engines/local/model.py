@@ -126,12 +126,14 @@ class LocalModel:
             if cell is None:
                 continue
             sums = self.sums[code]
-            count, posterior, d = learn(
+            if sums.stale[0] >= self.refresh_every:
+                # Before the sample is learned, which nothing is forgotten of yet.
+                posterior, d = refresh(cell.used, sums, self._keep(int(sums.stale[0])))
+                cell = cell._replace(posterior=posterior, d=d)
+            used, posterior, d = learn(
                 self.numbers, self.noise, self.settings.novelty, cell, sums, x, prior[:, 0], residual
             )
-            if sums.stale[0] >= self.refresh_every:
-                posterior, d = refresh(count, sums, self._keep(int(sums.stale[0])))
-            changed[code] = Cell(count, cell.inputs, cell.prior, posterior, d)
+            changed[code] = Cell(used, cell.inputs, cell.prior, posterior, d)
         # At once, so that a snapshot has a sample in all of its cells or in none.
         self.cells.update(changed)
         return Coverage.LEARNED if changed else Coverage.UNVISITED
@@ -143,11 +145,20 @@ class LocalModel:
         this is what `learn` comes to sample by sample.
         """
         codes, _ = weights_of(self.grid, inputs[0], self.settings.active)
-        for code in np.unique(codes[codes >= 0]).tolist():
+        # In the order of their first visit, as a stream comes to them: there may be more than `settings.cells`.
+        for code in dict.fromkeys(codes[codes >= 0].tolist()):
             rows = np.flatnonzero((codes == code).any(axis=1))
             cell = self._visit(code)
             if cell is not None:
                 self.cells[code] = self._taught(cell, self.sums[code], inputs[:, rows], residual[:, rows])
+
+    def compile(self, x: Floats) -> None:
+        """Compile all that a loop calls, at inputs `x` `(axes, D)` within the grid; nothing is learned."""
+        scratch = replace(self, cells={}, sums={})
+        scratch.learn(x, np.zeros(len(x)))
+        scratch.view.predict(x)
+        for code, cell in scratch.cells.items():
+            refresh(cell.used, scratch.sums[code], 1.0)
 
     @property
     def refresh_every(self) -> int:
@@ -171,7 +182,7 @@ class LocalModel:
                 sums.gram[axis] += white.T @ white
                 sums.moment[axis] += white.T @ scaled
         sums.samples[0] += n
-        posterior, d = refresh(cell.count, sums, 1.0)
+        posterior, d = refresh(cell.used, sums, 1.0)
         return cell._replace(posterior=posterior, d=d)
 
     def _visit(self, code: int, learning: Iterable[int] = ()) -> Cell | None:
@@ -191,7 +202,7 @@ class LocalModel:
         return empty_cell(axes, inducing, self.width)
 
     def _keep(self, samples: int) -> float:
-        """Weight of what a cell was taught before the last `samples`."""
+        """Weight that what a cell was taught keeps after so many more `samples`; it is forgotten in such steps."""
         memory = self.settings.forgetting
         return 1.0 if memory is None else float(np.exp(-samples / memory))
 
