@@ -48,7 +48,7 @@ bench: $(INSTALLED)
 # The figures quoted in the README and the notebooks; writes results/*.json. Over an hour on two cores; on one
 # thread each, so that rounding is the same everywhere.
 results: $(INSTALLED)
-	for part in core recordings reading closed_loop simulated_arm planning coupled calibration sampling; do \
+	for part in core recordings reading human_experiment closed_loop simulated_arm planning coupled calibration sampling; do \
 		OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.$${part}_results || exit 1; done
 
 # The API reference, from the docstrings, in docs/api/.

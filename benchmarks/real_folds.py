@@ -1,8 +1,8 @@
 """Real recordings in the paper's setting: each run predicted from the others of its task, or its end from its start.
 
 Every fold is predicted by the models of `benchmarks.paper_protocol`, whose naive GP is trained on the runs that are not
-held out, and by impedance models that learn all their hyperparameters from the same forces. Hyperpriors of what they
-share with the naive GP (residual and noise) and restarts are the same for all.
+held out, and by an impedance model that learns all its hyperparameters from the same forces. Hyperpriors of what it
+shares with the naive GP (residual and noise) and restarts are the same.
 """
 
 from __future__ import annotations
@@ -22,11 +22,8 @@ from benchmarks.results import RECORDINGS, Results
 
 RESTARTS = 1
 
-#: Models that learn impedance, too, and how they differ from the paper's setting.
-LEARNED: Mapping[str, Sequence[str]] = {
-    "learned_impedance": (),
-    "learned_impedance_with_acceleration": ("model.drop_acceleration=false",),
-}
+#: The model that learns its impedance, too.
+LEARNED = "learned_impedance"
 
 
 @dataclass(frozen=True)
@@ -96,12 +93,12 @@ def reused(name: str, restarts: int = RESTARTS, only: int | None = None) -> list
     return found
 
 
-def learned(name: str, model: str) -> list[Results]:
-    """By fold: axis → scores of one of the models that learn all their hyperparameters."""
-    config = configuration(TASKS[name], LEARNED[model])
+def learned(name: str) -> list[Results]:
+    """By fold: axis → scores of the model that learns all its hyperparameters."""
+    config = configuration(TASKS[name])
     found = []
     for fold in _folds(TASKS[name], config):
-        predictors = {model: train_impedance(config, fold.training, None)}
+        predictors = {LEARNED: train_impedance(config, fold.training, None)}
         found.append(scores_of(predictors, fold.training, fold.target, fold.test))
     return found
 

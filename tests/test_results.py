@@ -14,11 +14,12 @@ from benchmarks.closed_loop_results import SEEDS, WAYS, estimate
 from benchmarks.core_results import configuration_of, coverage_of, demo, known_equilibrium
 from benchmarks.coupled_results import SEEDS as COUPLED_SEEDS
 from benchmarks.coupled_results import identified
-from benchmarks.human_experiment_results import AMOUNTS
+from benchmarks.human_experiment_results import AMOUNTS, MORE
 from benchmarks.human_experiment_results import subject as unseen_repetitions
 from benchmarks.ledger import Ledger
 from benchmarks.planning_results import ARMS, CHECKED_PERTURBATIONS, PERTURBATIONS, planned, widths
 from benchmarks.reading_results import BAGS, RECORDINGS, bag
+from benchmarks.real_folds import LEARNED, TWELVE, held_out, reused
 from benchmarks.recordings_results import last_third
 from benchmarks.sampling_results import SEEDS as SAMPLED_SEEDS
 from benchmarks.sampling_results import short_run
@@ -269,17 +270,28 @@ def test_human_experiment() -> None:
 def test_human_experiment_on_real_runs() -> None:
     """Twelve folds, all axes: better on average; in most of them only where the chain rule is complete."""
     figures = committed("human_experiment")["figures"]["recordings"]
-    for protocol in ("reused", "learned"):
-        assert all(
-            fold["samples"] <= 1500 for task in figures[protocol]["tasks"].values() for fold in task["folds"]
-        )
-        summary = figures[protocol]["twelve_folds"]
+    assert all(0 < fold["samples"] <= 1500 for task in figures["tasks"].values() for fold in task["folds"])
+    assert {name: len(task["folds"]) for name, task in figures["tasks"].items()} == {
+        **dict.fromkeys(TWELVE, 3), "panda": 6, "rail": 1
+    }  # fmt: skip
+    for key in ("twelve_folds", f"twelve_folds_{MORE}_restarts"):
+        summary = figures[key]
         assert summary["folds"] == 12
         assert summary["impedance"]["axes_of"] == 36
         assert summary["impedance"]["msll"] < summary["naive"]["msll"]
-    complete = figures["reused"]["twelve_folds"]["impedance_with_acceleration"]
-    assert complete["msll"] < figures["reused"]["twelve_folds"]["impedance"]["msll"]
-    assert complete["axes_won"] > 27
+        complete = summary["impedance_with_acceleration"]
+        assert complete["msll"] < summary["impedance"]["msll"]
+        assert complete["axes_won"] > 27
+    assert figures["twelve_folds"][LEARNED]["msll"] < figures["twelve_folds"]["naive"]["msll"]
+
+
+def test_a_fold_of_the_human_experiment(shared_data: Path) -> None:
+    fold = committed("human_experiment")["figures"]["recordings"]["tasks"]["acc_rail"]["folds"][0]
+    assert held_out("acc_rail")[0] == {key: fold[key] for key in ("held_out", "samples")}
+    (now,) = reused("acc_rail", only=0)
+    for axis, models in now.items():
+        for model, scores in models.items():
+            assert scores["msll"] == pytest.approx(fold["axes"][axis][model]["msll"], abs=0.05)
 
 
 def test_ledger_goes_on_behind_the_last_job(tmp_path: Path) -> None:
