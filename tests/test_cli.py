@@ -539,6 +539,21 @@ def test_ctrl_c_of_other_commands(command, tiny, tmp_path, monkeypatch, name):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_ctrl_c_within_infer_writes_nothing(command, tiny, tmp_path, monkeypatch):
+    @contextmanager
+    def progress(*_: object):
+        def hook(done: int, total: int) -> None:
+            assert 0 < done <= total
+            raise KeyboardInterrupt
+
+        yield hook
+
+    monkeypatch.setattr(terminal, "inference_progress", progress)
+    done = command("infer", tiny.model, tiny.other, "--out", tmp_path / "p.csv")
+    assert (done.code, done.out, done.err) == (130, "", "interrupted; no file was left half written\n")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_ctrl_c_while_the_baseline_trains_gives_no_scores(command, tiny, tmp_path, interrupting):
     """A baseline that is half trained would be no fair competitor."""
     interrupting(after=1)

@@ -57,16 +57,17 @@ class _Group:
     targets: int
 
 
-def plan(log: PreparedLog, given: PreparedLog | None, coupled: bool) -> list[Batch]:
+def plan(log: PreparedLog, given: PreparedLog | None, coupled: bool, alike_below: int = 0) -> list[Batch]:
     """Every group of `log` in one batch, or several where it has many samples, with its forces in `given`.
 
-    The largest batches come first, so that no thread starts one when the others have ended.
+    Groups of fewer forces than `alike_below` share a batch with those of as many. The largest batches come first, so
+    that no thread starts one when the others have ended.
     """
     axes = len(log.axes)
     # Entries of a covariance for each pair of a force and a target of a group.
     width = axes**2 if coupled else axes
     batches: list[tuple[float, Batch]] = []
-    for groups in _alike(_groups(log, given), width):
+    for groups in _alike(_groups(log, given), width, alike_below):
         forces, targets = max(g.forces for g in groups), max(g.targets for g in groups)
         step = conditioning.targets_at_once(len(groups) * width * forces)
         most = max(PIECES, -(-4 * forces // step)) * step
@@ -146,7 +147,7 @@ def _work(forces: int, targets: int) -> float:
     return (forces + 1.0) * (forces + targets)
 
 
-def _alike(groups: Sequence[_Group], width: int) -> Iterator[list[_Group]]:
+def _alike(groups: Sequence[_Group], width: int, alike_below: int) -> Iterator[list[_Group]]:
     """Groups of similar length together, as many as memory and padding allow."""
     batch: list[_Group] = []
     own = 0.0
@@ -156,7 +157,8 @@ def _alike(groups: Sequence[_Group], width: int) -> Iterator[list[_Group]]:
         work = _work(forces, group.targets)
         entries = count * width * max(1, forces) * max(forces, min(targets, conditioning.CHUNK))
         # Priors alone and forces do not mix: a batch has forces of every group, or none.
-        apart = batch and (batch[0].forces == 0) != (forces == 0)
+        least = max(1, alike_below)
+        apart = batch and min(batch[0].forces, least) != min(forces, least)
         if batch and (
             apart or entries > conditioning.ENTRIES or count * _work(forces, targets) > PADDING * (own + work)
         ):

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 import torch
 from torch import Tensor
 
+from bayes_impedance.engines.closed_loop import ANCHORS
 from bayes_impedance.features import Features, LogFeatures
 from bayes_impedance.kernels.coupled import CoupledInteractionKernel
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, InteractionKernel, Latent
@@ -89,7 +90,9 @@ def infer_log(
                 collected.put(piece, moments(piece), batch.target)
                 yield sum(len(rows) for rows in samples)
 
-    batches = plan(log, None if given is None else given.log, model.is_coupled)
+    # The anchors of an apparent mass are as many as the samples, padding counted in, where these are few.
+    alike_below = 0 if target.feature_map.device is None else ANCHORS
+    batches = plan(log, None if given is None else given.log, model.is_coupled, alike_below)
     for_each(infer, batches, log.n_samples, progress)
     return _posterior(model, collected, latents)
 
