@@ -1,6 +1,7 @@
 """Learning and prediction sample by sample: against posteriors, beside readers, through bad samples."""
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from streams import SHARED, model_of, same, samples, stream
 from bayes_impedance.engines.local.model import Coverage
 from bayes_impedance.errors import ConfigurationError, LogError
 from bayes_impedance.kernels.impedance import Latent
+from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.online import OnlinePredictor
 
 MEAN = "model.desired_trajectory.mean"
@@ -110,8 +112,6 @@ def test_a_cold_start_predicts_the_prior(model):
 
 
 def _without_force(model):
-    from dataclasses import replace
-
     return replace(model.fitted.log.trials[0], force=None)
 
 
@@ -244,7 +244,7 @@ def test_readers_beside_a_writer(model):
             predictor.update(one._replace(time=one.time + 100.0 * i))
     # Learning may be over before a reader had its turn.
     while min(reads) < 20 and not problems:
-        pass
+        done.wait(0.001)
     done.set()
     for thread in threads:
         thread.join()
@@ -266,7 +266,6 @@ def test_a_snapshot_has_a_sample_in_all_of_its_cells_or_in_none(model):
     def read():
         while not done.is_set():
             cells = predictor._local.snapshot.cells
-            # The scaled squares of U's diagonal tell what a cell has seen; one that saw nothing has none.
             if any((cell.used == 0).any() for cell in cells.values()):
                 problems.append("an empty cell")
             if 0 < len(cells) < active:
@@ -304,13 +303,13 @@ def test_two_writers_wait_for_each_other(model):
 
 
 def test_cells_are_bounded(model):
-    config = model.config.engine.local.model_copy(update={"cells": 5})
+    config = model.config.engine.local.model_copy(update={"cells": 2, "active": 1})
     engine = model.config.engine.model_copy(update={"local": config})
     predictor = OnlinePredictor(
         type(model)(model.config.model_copy(update={"engine": engine}), model.fitted), warm=False
     )
     found = [predictor.update(one) for one in stream(model)]
-    assert predictor.cells == 5
+    assert predictor.cells == 2
     assert Coverage.UNVISITED in found
     assert predictor.samples == sum(one is Coverage.LEARNED for one in found)
 
@@ -352,8 +351,6 @@ def test_a_model_of_one_group_needs_no_name(model):
 
 
 def test_a_model_must_be_fitted():
-    from bayes_impedance.model import ImpedanceModel
-
     with pytest.raises(ConfigurationError, match="expected a fitted model"):
         OnlinePredictor(ImpedanceModel.from_config("position", [SHARED]))
 
