@@ -170,7 +170,7 @@ class OnlinePredictor:
         """
         with self._lock:
             scalars = {"samples": np.array([self.samples]), "last": np.array([self._last])}
-            write_state(Path(path), self._local, scalars)
+            write_state(Path(path), self._local, self.group, scalars)
 
     @classmethod
     def resume(cls, path: str | Path, model: ImpedanceModel, group: str | None = None) -> Self:
@@ -181,7 +181,7 @@ class OnlinePredictor:
             ConfigurationError: as in the beginning.
         """
         predictor = cls(model, group, warm=False)
-        scalars = read_state(Path(path), predictor._local)
+        scalars = read_state(Path(path), predictor._local, predictor.group)
         predictor.samples, predictor._last = int(scalars["samples"][0]), float(scalars["last"][0])
         return predictor
 

@@ -18,8 +18,8 @@ from bayes_impedance.sealed import DamagedFileError, read_sealed, write_sealed
 Arrays = Mapping[str, NDArray[Any]]
 
 
-def write_state(path: Path, local: LocalModel, scalars: Arrays) -> None:
-    """Write what `local` has learned, and `scalars` beside it.
+def write_state(path: Path, local: LocalModel, group: str, scalars: Arrays) -> None:
+    """Write what `local` has learned of a group, and `scalars` beside it.
 
     Raises:
         OutputError: the file cannot be written.
@@ -31,14 +31,14 @@ def write_state(path: Path, local: LocalModel, scalars: Arrays) -> None:
         for name in fields:
             values = [getattr(known[code], name) for code in codes]
             arrays[f"{kind}.{name}"] = np.stack(values) if values else np.zeros(0)
-    write_sealed(path, arrays, {"model": fingerprint(local)})
+    write_sealed(path, arrays, {"model": fingerprint(local), "group": group})
 
 
-def read_state(path: Path, local: LocalModel) -> dict[str, NDArray[Any]]:
+def read_state(path: Path, local: LocalModel, group: str) -> dict[str, NDArray[Any]]:
     """Give `local`, which has learned nothing, what `write_state` wrote; the scalars beside it.
 
     Raises:
-        OutputError: the file lacks, is damaged, or is of another model.
+        OutputError: the file lacks, is damaged, or is of another model or group.
     """
     try:
         arrays, about = read_sealed(path)
@@ -51,7 +51,7 @@ def read_state(path: Path, local: LocalModel) -> dict[str, NDArray[Any]]:
             f"{path}: expected the state of a predictor, found a damaged or another file; restore it, or begin anew "
             "from the model"
         ) from error
-    if about.get("model") != fingerprint(local):
+    if about != {"model": fingerprint(local), "group": group}:
         raise OutputError(
             f"{path}: expected the state of a predictor of this model, group and engine.local, found that of another; "
             "resume it with those that it was begun with"
