@@ -20,7 +20,7 @@ from benchmarks.results import Results, commit
 
 SEED, THINNED = 0, 99
 #: Truths of each method: a fit of a guide takes as long as its chain would.
-DRAWS = {"nuts": 200, "svi": 60, "laplace": 200}
+DRAWS = {"nuts": 200, "svi": 200, "laplace": 200}
 #: Two repetitions of 18 samples [s, Hz].
 REPETITIONS, DURATION, RATE = 2, 4.0, 4.5
 PROBLEM = (

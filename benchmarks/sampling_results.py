@@ -46,9 +46,9 @@ SCALES_KNOWN = tuple(
     for scale in ("log_sd", "length_scale.phase")
 )
 #: Iterations of each of four chains, as few as reach an R-hat of 1.01.
-RECOVERY = {"warmup": 100, "draws": 400}
-ARM = {"warmup": 150, "draws": 150}
-UNPERTURBED = {"warmup": 100, "draws": 100}
+RECOVERY = {"warmup": 100, "draws": 700}
+ARM = {"warmup": 150, "draws": 250}
+UNPERTURBED = {"warmup": 100, "draws": 200}
 #: At .8 one draw in forty diverges.
 ROBOT = {"warmup": 150, "draws": 400, "target_acceptance": 0.95}
 AGAIN = {"chains": 2, "warmup": 30, "draws": 50}

@@ -218,8 +218,7 @@ def test_sampling() -> None:
     assert recovery["stiffness"]["error_median"] <= 0.02
     assert recovery["damping"]["error_median"] <= 0.05
     assert recovery["mass"]["error_median"] <= 0.03
-    # One seed of the twenty ends at 1.0106 with these draws.
-    assert sum(rhat <= 1.01 for rhat in recovery["rhat_max"]) >= 19
+    assert recovery["largest_rhat"] <= 1.01
     assert recovery["seeds_without_divergences"] >= 18
     for entry in ("xx", "yy", "xy"):
         assert figures["arm"][f"stiffness_{entry}"]["nuts"]["relative_width"] <= 0.5
