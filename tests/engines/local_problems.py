@@ -10,11 +10,11 @@ import torch
 from numpy.typing import NDArray
 
 from bayes_impedance.config import Config, LocalConfig, load_config
+from bayes_impedance.engines.compiled.covariance import covariances, variances
+from bayes_impedance.engines.compiled.numbers import KernelNumbers
 from bayes_impedance.engines.local.cell import Cell, Sums, empty_cell, learn, moments
-from bayes_impedance.engines.local.covariance import covariances, variances
 from bayes_impedance.engines.local.grid import Grid
 from bayes_impedance.engines.local.model import LocalModel
-from bayes_impedance.engines.local.numbers import KernelNumbers
 from bayes_impedance.features import FeatureMap
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.priors import ForceModel, build_force_model

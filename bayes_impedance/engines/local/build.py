@@ -10,11 +10,12 @@ import torch
 from numpy.typing import NDArray
 
 from bayes_impedance.config import LocalConfig
+from bayes_impedance.engines.compiled.numbers import KernelNumbers
 from bayes_impedance.engines.local.grid import Grid
 from bayes_impedance.engines.local.model import LocalModel
-from bayes_impedance.engines.local.numbers import KernelNumbers
 from bayes_impedance.errors import ConfigurationError
 from bayes_impedance.features import FeatureMap
+from bayes_impedance.kernels.impedance import InteractionKernel
 from bayes_impedance.priors import ForceModel
 
 Floats = NDArray[np.float64]
@@ -31,7 +32,18 @@ def build_local(
     Raises:
         ConfigurationError: the model is none that local models hold, or the widths fit no grid.
     """
-    numbers = KernelNumbers.of(model.kernel, feature_map.width)
+    kernel = model.kernel
+    if not isinstance(kernel, InteractionKernel):
+        raise ConfigurationError(
+            "engine.name: expected model.axes: independent and an impedance model with local, got "
+            f"{type(kernel).__name__}; set model.axes=independent, or engine.name=auto"
+        )
+    if kernel.motion_noise is not None:
+        raise ConfigurationError(
+            "model.position_noise_sd: expected null with local sparse models, whose samples are independent given the "
+            "force, got a noise; set model.position_noise_sd=null"
+        )
+    numbers = KernelNumbers.of(kernel, feature_map.width)
     axes = len(feature_map.axes)
     with torch.no_grad():
         noise = model.noise_variance.expand(axes, 1, 1).reshape(axes).numpy().copy()

@@ -18,7 +18,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from bayes_impedance.engines.local.covariance import covariances, variances
+from bayes_impedance.engines.compiled.covariance import covariances, variances
+from bayes_impedance.engines.compiled.numbers import KernelNumbers
 from bayes_impedance.engines.local.factors import (
     factorise,
     inner,
@@ -27,7 +28,6 @@ from bayes_impedance.engines.local.factors import (
     solve_transposed,
     squared_norm,
 )
-from bayes_impedance.engines.local.numbers import KernelNumbers
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

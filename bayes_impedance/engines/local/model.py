@@ -12,6 +12,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from bayes_impedance.config import LocalConfig
+from bayes_impedance.engines.compiled.covariance import variances
+from bayes_impedance.engines.compiled.numbers import KernelNumbers
 from bayes_impedance.engines.local.cell import (
     Cell,
     Sums,
@@ -23,9 +25,7 @@ from bayes_impedance.engines.local.cell import (
     refresh,
     whitened,
 )
-from bayes_impedance.engines.local.covariance import variances
 from bayes_impedance.engines.local.grid import Grid, nearest, weights_of
-from bayes_impedance.engines.local.numbers import KernelNumbers
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -12,7 +12,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from bayes_impedance.engines.local.numbers import NONE, RATIONAL_QUADRATIC, SQUARED_EXPONENTIAL, KernelNumbers
+from bayes_impedance.engines.compiled.numbers import (
+    NONE,
+    RATIONAL_QUADRATIC,
+    SQUARED_EXPONENTIAL,
+    KernelNumbers,
+)
 
 Floats = NDArray[np.float64]
 
@@ -165,8 +170,10 @@ def _part(numbers: KernelNumbers, axis: int, part: int, inputs: Floats, x: Float
 
 
 @njit(cache=True, nogil=True)
-def _impedance(numbers: KernelNumbers, axis: int, order: int, inputs: Floats, x: Floats, out: Floats) -> None:
-    """Cov[w, w'] of stiffness, damping or mass, number `order`, into `out` `(n,)`."""
+def impedance_covariances(
+    numbers: KernelNumbers, axis: int, order: int, inputs: Floats, x: Floats, out: Floats
+) -> None:
+    """Cov[w, w'] of stiffness, damping or mass, number `order`, of `inputs` `(D, n)` with `x`, into `out` `(n,)`."""
     if numbers.part_columns[order, 0] == NONE:
         out[:] = numbers.part_variance[axis, order]
     else:
@@ -202,7 +209,7 @@ def covariances(numbers: KernelNumbers, axis: int, inputs: Floats, x: Floats, ou
             for t in range(n):
                 out[0, t] += weight * table[3 * i + j, t]
     for j in range(orders):
-        _impedance(numbers, axis, j, inputs, x, own)
+        impedance_covariances(numbers, axis, j, inputs, x, own)
         for t in range(n):
             out[0, t] += own[t] * table[4 * j, t]
         if numbers.error.size:

@@ -7,8 +7,9 @@ import torch
 from gpytorch.kernels import AdditiveKernel
 from local_problems import ROWS, Problem, compiled, own_variances
 
-from bayes_impedance.config import load_config
-from bayes_impedance.engines.local.numbers import KernelNumbers
+from bayes_impedance.config import LocalConfig, load_config
+from bayes_impedance.engines.compiled.numbers import KernelNumbers
+from bayes_impedance.engines.local.build import build_local
 from bayes_impedance.errors import ConfigurationError
 from bayes_impedance.features import FeatureMap
 from bayes_impedance.kernels import (
@@ -221,8 +222,8 @@ def test_a_covariance_that_is_not_stationary_is_refused():
     problem = Problem.of("phase")
     linear = gpytorch.kernels.LinearKernel(batch_shape=BATCH).double()
     with pytest.raises(
-        ConfigurationError,
-        match="expected stationary covariances with local, got LinearKernel; set engine.name=dense",
+        TypeError,
+        match="compiled covariance: expected covariances of class StationaryKernel, got LinearKernel",
     ):
         custom(problem, linear)
     process = ImpedanceProcess(gpytorch.kernels.ConstantKernel(batch_shape=BATCH), batch_shape=BATCH)
@@ -230,17 +231,21 @@ def test_a_covariance_that_is_not_stationary_is_refused():
     kernel = InteractionKernel(
         ImpedanceKernel(impedance.layout, impedance.trajectory, process, impedance.damping, None)
     ).double()
-    with pytest.raises(ConfigurationError, match="got ConstantKernel"):
+    with pytest.raises(TypeError, match="got ConstantKernel"):
         KernelNumbers.of(kernel, problem.feature_map.width)
 
 
 def test_coupled_axes_and_noise_of_the_motion_are_refused():
-    with pytest.raises(
-        ConfigurationError,
-        match="expected model.axes: independent and an impedance model with local, got Coupled",
+    for name, overrides, refusal in (
+        ("coupled", [], "expected model.axes: independent and an impedance model with local, got Coupled"),
+        (
+            "phase",
+            ["model.position_noise_sd=0.0001"],
+            "expected null with local sparse models, whose samples are",
+        ),
     ):
-        Problem.of("coupled")
-    config = load_config("phase", ["model.position_noise_sd=0.0001"])
-    feature_map = FeatureMap(config, ("x", "y"))
-    with pytest.raises(ConfigurationError, match="expected null with local sparse models, whose samples are"):
-        KernelNumbers.of(build_force_model(config, feature_map).kernel, feature_map.width)
+        config = load_config(name, overrides)
+        feature_map = FeatureMap(config, ("x", "y"))
+        visited = np.zeros((2, feature_map.width))
+        with pytest.raises(ConfigurationError, match=refusal):
+            build_local(build_force_model(config, feature_map), feature_map, LocalConfig(), visited)

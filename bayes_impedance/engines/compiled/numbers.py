@@ -11,7 +11,6 @@ from gpytorch.kernels import AdditiveKernel, Kernel
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bayes_impedance.errors import ConfigurationError
 from bayes_impedance.kernels.impedance import InteractionKernel
 from bayes_impedance.kernels.stationary import (
     Matern,
@@ -58,32 +57,30 @@ class KernelNumbers(NamedTuple):
     part_variance: Floats
     part_shape: Floats
 
+    @property
+    def variances(self) -> Floats:
+        """Prior variances of stiffness, damping and mass, `(axes, orders)`: stationary as they are."""
+        own = self.part_variance[:, : self.gaussian.size]
+        return np.where(self.gaussian, own, self.expectation**2 * np.expm1(own))
+
     @classmethod
     def of(cls, kernel: InteractionKernel, width: int) -> KernelNumbers:
-        """Those of a kernel of batch shape `(axes, 1)` whose inputs have `width` columns.
+        """Those of a kernel of batch shape `(axes, 1)`, or of one axis without, whose inputs have `width` columns.
+
+        Noise of the recorded motion is not among them.
 
         Raises:
-            ConfigurationError: noise of the recorded motion is in it, or a covariance that is not stationary.
+            TypeError: a covariance of a class whose numbers are not known.
         """
-        if not isinstance(kernel, InteractionKernel):
-            raise ConfigurationError(
-                "engine.name: expected model.axes: independent and an impedance model with local, got "
-                f"{type(kernel).__name__}; set model.axes=independent, or engine.name=auto"
-            )
-        if kernel.motion_noise is not None:
-            raise ConfigurationError(
-                "model.position_noise_sd: expected null with local sparse models, whose samples are independent given "
-                "the force, got a noise; set model.position_noise_sd=null"
-            )
         impedance, layout = kernel.impedance, kernel.impedance.layout
-        axes = kernel.batch_shape[0]
+        axes = kernel.batch_shape[0] if kernel.batch_shape else 1
         processes = impedance.processes
         parts = [process.covariance for process in processes] + _summands(kernel.residual)
         for part in (impedance.trajectory, *parts):
             if not isinstance(part, StationaryKernel):
-                raise ConfigurationError(
-                    f"engine.name: expected stationary covariances with local, got {type(part).__name__}; set "
-                    "engine.name=dense"
+                raise TypeError(
+                    "compiled covariance: expected covariances of class StationaryKernel, got "
+                    f"{type(part).__name__}; use the dense posterior for it"
                 )
         columns = [_columns_of(part, width) for part in parts]
         widest = max([1, *map(len, columns)])

@@ -1,0 +1,1 @@
+"""The covariance of the force, compiled: for loops that have microseconds."""
