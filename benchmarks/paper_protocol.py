@@ -4,6 +4,9 @@ Medina, Endo, Hirche 2016, section V-B: θ = ξ = [x, ẋ], x_d around the hand,
 chain rule; μ_m = 3 kg, μ_d = 15 ± 5 Ns/m, μ_k = 300 ± 50 N/m, x_d with a variance of 1e-4 m², all known and none
 learned; the residual takes the hyperparameters of the naive GP. What cannot be read in the paper's text is said in
 `UNREADABLE`. Other people, other robot: no figure of the paper is replicated.
+
+`WITH_ACCELERATION` is the same model with the complete chain rule. It is no fair rival of the naive GP, for it sees the
+acceleration, which on a robot that answers force by motion holds the force of the same instant.
 """
 
 from __future__ import annotations
