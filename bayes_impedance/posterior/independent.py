@@ -65,7 +65,7 @@ class IndependentConditioner:
             result[latent] = _broadcast(x.shape[:-1], *moments)
         return result
 
-    def _moments(self, x: Tensor, latent: Latent, prior: _Prior, cross: Tensor) -> Sequence[Tensor]:
+    def _moments(self, x: Tensor, latent: Latent, prior: LatentPrior, cross: Tensor) -> Sequence[Tensor]:
         white = self.factor.whiten(cross)
         # On padding α is zero.
         location = prior.location + (cross.mT @ self.factor.alpha.unsqueeze(-1)).squeeze(-1)
@@ -101,7 +101,7 @@ def is_warped(model: ForceModel, latent: Latent) -> bool:
     return process.law == "log_gaussian"
 
 
-class _Prior(NamedTuple):
+class LatentPrior(NamedTuple):
     """Prior of a latent at some samples, `(axes, groups, m)` each or what broadcasts to it.
 
     `location` at the fitted levels, `shown` before training; `own_variance` at known levels and without noise,
@@ -153,13 +153,13 @@ class IndependentPrior:
             return False
         return kernel.impedance.processes[IMPEDANCE_ORDER[latent]].covariance.num_dims == 0
 
-    def at(self, target: Features, latents: Sequence[Latent]) -> dict[Latent, _Prior]:
+    def at(self, target: Features, latents: Sequence[Latent]) -> dict[Latent, LatentPrior]:
         """Prior of each latent at the samples of `target`."""
         x = target.inputs
         derivatives = self.derivatives(x, x, latents, diag=True)
         return {latent: self._at(target, latent, derivatives) for latent in latents}
 
-    def _at(self, target: Features, latent: Latent, derivatives: Derivatives | None) -> _Prior:
+    def _at(self, target: Features, latent: Latent, derivatives: Derivatives | None) -> LatentPrior:
         model = self.model
         own = self._own_variance(target.inputs, latent, derivatives)
         loading = _level_loading(model, target.inputs, latent)
@@ -168,18 +168,18 @@ class IndependentPrior:
             variance = own + (loading.square() * self.level_variance.unsqueeze(-2)).sum(-1)
         if latent is Latent.FORCE:
             location = model.prior_mean(target.inputs)
-            return _Prior(location, location, own, variance + model.noise_variance, loading)
+            return LatentPrior(location, location, own, variance + model.noise_variance, loading)
         if latent is Latent.RESIDUAL_FORCE:
             location = torch.zeros_like(own)
-            return _Prior(location, location, own, variance, loading)
+            return LatentPrior(location, location, own, variance, loading)
         if latent in TRAJECTORY_ORDER:
             location = target.trajectory_mean[..., TRAJECTORY_ORDER[latent]]
-            return _Prior(location, location, own, variance, loading)
+            return LatentPrior(location, location, own, variance, loading)
         process = model.kernel.impedance.processes[IMPEDANCE_ORDER[latent]]
         level, median = process.level[..., 0], self._medians[latent]
         if process.law == "log_gaussian":
             level, median = level.log(), median.log()
-        return _Prior(level, median, own, variance, loading)
+        return LatentPrior(level, median, own, variance, loading)
 
     def _own_variance(self, x: Tensor, latent: Latent, derivatives: Derivatives | None) -> Tensor:
         """Prior variance at known levels, without noise."""
