@@ -1,12 +1,11 @@
 """Posteriors with `engine.name: local` against dense ones: exact with one cell, near with many."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from streams import SHARED, model_of
 
 from bayes_impedance.config import load_config
 from bayes_impedance.errors import ConfigurationError
@@ -17,16 +16,7 @@ from bayes_impedance.posterior import conditioning
 from bayes_impedance.posterior.local import LocalConditioner, local_posterior
 from bayes_impedance.trajectory_mean import TrajectoryMean
 
-sys.path.append(str(Path(__file__).parent / "online"))
-
-from streams import SHARED, model_of
-
 MEAN = "model.desired_trajectory.mean"
-ONE_CELL = (
-    "engine.local.novelty=0",
-    "engine.local.inducing=300",
-    "engine.local.active=1",
-)
 
 
 def with_engine(model, name, **local):
@@ -95,17 +85,17 @@ def test_one_cell_is_dense_for_every_latent(model, given):
 
 
 def test_levels_widen_what_depends_on_them():
-    """Against the same model with levels that are known."""
-    free = model_of("phase", (SHARED, f"{MEAN}=reference"))
-    fixed = [f"model.{name}.level=200" for name in ("stiffness", "damping")] + ["model.mass.level=1.5"]
-    config = load_config("phase", (SHARED, f"{MEAN}=reference", *fixed))
-    known = ImpedanceModel(config, free.fitted)
-    assert known.fitted is free.fitted
+    """Against the same hyperparameters with levels that are known."""
+    overrides = (SHARED, f"{MEAN}=reference")
+    levels = ("model.stiffness.level=300", "model.damping.level=20", "model.mass.level=1.5")
+    free, known = model_of("phase", overrides), model_of("phase", (*overrides, *levels))
+    assert known.config.model.stiffness.level.fixed
     found = one_cell(free).posterior(free.fitted.log, "training")
-    dense = with_engine(free, "dense").posterior(free.fitted.log, "training")
-    assert_same(found, dense)
-    # The prior of a level is wide, so most of what is not known of stiffness is its level.
-    assert (found["stiffness"].prior_scale > 0.9).all()
+    certain = one_cell(known).posterior(known.fitted.log, "training")
+    assert_same(certain, with_engine(known, "dense").posterior(known.fitted.log, "training"))
+    # log_sd of the level is 1, of the process .3 or so.
+    assert (found["stiffness"].prior_scale > 1.0).all()
+    assert (certain["stiffness"].prior_scale < 0.6).all()
     assert (found["stiffness"].scale < found["stiffness"].prior_scale).all()
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from streams import SHARED, model_of, same, samples, stream
+from streams import SHARED, model_of, same, samples, state, stream
 
 from bayes_impedance.engines.local.model import Coverage
 from bayes_impedance.errors import ConfigurationError, LogError
@@ -29,15 +29,6 @@ def model():
 @pytest.fixture
 def predictor(model):
     return OnlinePredictor(model)
-
-
-def state(predictor):
-    """All that an update may change."""
-    local = predictor._local
-    arrays = [
-        array.copy() for code in sorted(local.cells) for array in (*local.cells[code], *local.sums[code])
-    ]
-    return [*arrays, np.array([predictor.samples, predictor.last, len(local.cells), len(local.sums)])]
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from streams import SHARED, model_of, same, stream
-from test_online_predictor import state
+from streams import SHARED, model_of, same, state, stream
 
 from bayes_impedance.errors import LogError, OutputError
 from bayes_impedance.online import OnlinePredictor
@@ -102,7 +101,7 @@ for i in range(10_000):
 def test_a_kill_in_the_middle_of_a_save_leaves_a_whole_state(model, tmp_path):
     """No sample of the last save that ended is lost, and no half of one is read."""
     path = tmp_path / "state.safetensors"
-    here = str(Path(__file__).parent)
+    here = str(Path(__file__).parent.parent)
     code = KILLED.format(paths=[here], overrides=OVERRIDES, path=str(path))
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None

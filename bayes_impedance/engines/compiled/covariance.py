@@ -227,8 +227,9 @@ def covariances(numbers: KernelNumbers, axis: int, inputs: Floats, x: Floats, ou
 @njit(cache=True, nogil=True)
 def variances(numbers: KernelNumbers, axis: int, x: Floats, out: Floats) -> None:
     """Prior variances of force (without noise) [N²], x_d [m²] and ẋ_d [m²/s²] at `x` `(D,)`, into `out` `(3,)`."""
-    own = x.copy().reshape(x.size, 1)
-    force, table = np.empty((1, 1)), np.empty((9, 1))
+    # Views, as the inputs of a cell are: what is compiled for these serves here, too.
+    own = x.copy().reshape(x.size, 1)[:, :1]
+    force, table = np.empty((1, 1))[:, :1], np.empty((9, 1))
     covariances(numbers, axis, own, x, force)
     _tables(numbers, axis, own, x, table)
     out[0], out[1], out[2] = force[0, 0], table[0, 0], table[4, 0]

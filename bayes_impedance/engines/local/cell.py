@@ -182,7 +182,8 @@ def choose(numbers: KernelNumbers, axis: int, inputs: Floats, most: int, enough:
     """
     n = inputs.shape[0]
     most = min(most, n)
-    columns, own = np.ascontiguousarray(inputs.T), np.empty(3)
+    # Views, as the inputs of a cell are: what is compiled for these serves here, too.
+    columns, own = np.ascontiguousarray(inputs.T)[:, :n], np.empty(3)
     whole = np.empty(n)
     for i in range(n):
         variances(numbers, axis, inputs[i], own)
@@ -190,7 +191,7 @@ def choose(numbers: KernelNumbers, axis: int, inputs: Floats, most: int, enough:
     left = whole.copy()
     white = np.empty((most, n))
     chosen = np.empty(most, dtype=np.int64)
-    row = np.empty((1, n))
+    row = np.empty((1, n))[:, :n]
     for m in range(most):
         best = int(np.argmax(left))
         if left[best] <= max(enough, LEAST_NOVELTY * whole[best]):

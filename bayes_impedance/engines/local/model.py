@@ -150,7 +150,9 @@ class LocalModel:
             rows = np.flatnonzero((codes == code).any(axis=1))
             cell = self._visit(code)
             if cell is not None:
-                self.cells[code] = self._taught(cell, self.sums[code], inputs[:, rows], residual[:, rows])
+                self.cells[code] = self._taught(
+                    cell, self.sums[code], *map(np.ascontiguousarray, (inputs[:, rows], residual[:, rows]))
+                )
 
     def compile(self, x: Floats) -> None:
         """Compile all that a loop calls, at inputs `x` `(axes, D)` within the grid; nothing is learned."""

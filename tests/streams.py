@@ -8,11 +8,12 @@ from typing import Any, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from bayes_impedance.config import load_config
 from bayes_impedance.features import FeatureMap
 from bayes_impedance.model import Fit, ImpedanceModel
-from bayes_impedance.online import Sample
+from bayes_impedance.online import OnlinePredictor, Sample
 from bayes_impedance.preprocessing import PreparedLog, PreparedTrial
 from bayes_impedance.priors import build_force_model
 from bayes_impedance.simulation.generative import draw_force, repeated_motion
@@ -63,6 +64,15 @@ def stream(model: ImpedanceModel, seed: int = 5, n: int = 40) -> list[Sample]:
     motion = repeated_motion(2, duration=2.0, rate=n / 4.0, seed=seed)
     log = draw_force(model.config, motion, seed=seed)
     return [sample for i, trial in enumerate(log.trials) for sample in samples(trial, start=10.0 * (i + 1))]
+
+
+def state(predictor: OnlinePredictor) -> list[NDArray[Any]]:
+    """All that an update may change."""
+    local = predictor._local
+    arrays = [
+        array.copy() for code in sorted(local.cells) for array in (*local.cells[code], *local.sums[code])
+    ]
+    return [*arrays, np.array([predictor.samples, predictor.last, len(local.cells), len(local.sums)])]
 
 
 def same(one: Any, other: Any) -> bool:
