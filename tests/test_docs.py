@@ -119,7 +119,7 @@ def test_a_package_lists_what_it_offers_by_name(reference: Reference, package: s
 
 
 def test_front_page_opens_with_the_example_of_the_readme(reference: Reference) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    code, *_ = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
     assert code in reference.page_of("bayes_impedance").preformatted
 
 

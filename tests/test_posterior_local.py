@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from streams import SHARED, model_of
 
 from bayes_impedance.config import load_config
 from bayes_impedance.errors import ConfigurationError
-from bayes_impedance.features import FeatureMap, label_trials
+from bayes_impedance.features import FeatureMap, LogFeatures, label_trials, labels_of
 from bayes_impedance.kernels.impedance import Latent
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.posterior import conditioning
-from bayes_impedance.posterior.local import LocalConditioner, local_posterior
+from bayes_impedance.posterior.independent import IndependentPrior
+from bayes_impedance.posterior.local import LocalConditioner, infer_local
 from bayes_impedance.trajectory_mean import TrajectoryMean
 
 MEAN = "model.desired_trajectory.mean"
@@ -226,7 +226,6 @@ def test_functions_are_refused():
         ("inducing", 1, "greater than or equal to 2"),
         ("active", 0, "greater than or equal to 1"),
         ("active", 10, "less than or equal to 9"),
-        ("novelty", 1.0, "less than 1"),
         ("novelty", -0.1, "greater than or equal to 0"),
         ("cells", 0, "greater than or equal to 1"),
         ("forgetting", 0, "greater than 0"),
@@ -238,6 +237,12 @@ def test_functions_are_refused():
 def test_settings_out_of_range_are_refused(key, value, sentence):
     with pytest.raises(ConfigurationError, match=rf"(?s)engine\.local\.{key}.*{sentence}|{sentence}"):
         load_config("phase", [f"engine.local.{key}={value}"])
+
+
+def test_fewer_cells_than_the_motion_visits_are_refused():
+    model = with_engine(model_of("position", (SHARED,)), "local", cells=2)
+    with pytest.raises(ConfigurationError, match="which the given motion visits, got 2; raise it, or widen"):
+        model.posterior(model.fitted.log, "training")
 
 
 def test_a_device_that_answers_is_refused():
@@ -258,18 +263,19 @@ def test_coupled_axes_are_refused():
 
 
 def test_conditioning_beneath_the_model():
-    """`local_posterior` and its conditioner, as the model calls them."""
+    """`infer_local` and its conditioner, as the model calls them."""
     model = one_cell(model_of("phase", (SHARED,)))
     log = model.fitted.log
     feature_map = FeatureMap(model.config, log.axes)
     mean = TrajectoryMean.from_training(model.config.model.desired_trajectory, log)
-    features = feature_map(log, mean, label_trials(log), observed=True)
+    features = LogFeatures(feature_map, log, mean, labels_of(log, label_trials(log)))
     force_model = model.force_model(log.axes)
     settings = model.config.engine.local
-    found = local_posterior(force_model, feature_map, settings, log, features, features, [Latent.FORCE])
+    found = infer_local(force_model, features, features, settings, [Latent.FORCE])
     assert_same(found, model.posterior(log, "training", [Latent.FORCE]), [Latent.FORCE], relative=1e-12)
-    with torch.no_grad():
-        conditioner = LocalConditioner(force_model, feature_map, settings, features)
-        moments = conditioner.moments(features, [Latent.MASS])
+    conditioner = LocalConditioner(
+        IndependentPrior(force_model), feature_map, settings, features(observed=True)
+    )
+    moments = conditioner.moments(features(), [Latent.MASS])
     assert len(conditioner.learned) == 1
     assert moments[Latent.MASS][0].shape == (2, 1, 40)

@@ -60,6 +60,8 @@ class PointPredictor:
             self._loop_white = self._loop.white[:, 0].numpy()
             self._loop_slope = float(self._loop.jacobian.slope)
             self._loop_gain = float(self._loop.gain(self._loop.variance))
+        # The first call compiles; a control loop is not to wait for that.
+        self.predict(inputs[0])
 
     def predict(self, x: Array) -> tuple[float, float]:
         """E and Var of a new measurement of force [N, N²] at the inputs `x` `(D,)`, levels taken as known."""

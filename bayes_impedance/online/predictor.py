@@ -10,14 +10,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from bayes_impedance.engines.local.build import build_local
+from bayes_impedance.engines.local.build import build_local, learn_log
 from bayes_impedance.engines.local.model import Coverage, LocalModel, Snapshot
 from bayes_impedance.errors import ConfigurationError, LogError
 from bayes_impedance.features import FeatureMap
 from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.online.inputs import SampleInputs, fill, is_usable
 from bayes_impedance.online.sample import Sample
-from bayes_impedance.online.storage import read_state, write_state
+from bayes_impedance.online.storage import read_state, state_of, write_state
 from bayes_impedance.training import observations
 
 Floats = NDArray[np.float64]
@@ -25,6 +25,8 @@ Floats = NDArray[np.float64]
 
 class Prediction(NamedTuple):
     """By axis, `(axes,)` each: force of a new measurement [N], desired position [m] and velocity [m/s], variances.
+
+    Levels of stiffness, damping and mass count as known.
 
     `coverage` is `LEARNED` where the model has been near; else these are the prior's.
     """
@@ -121,7 +123,7 @@ class OnlinePredictor:
         if warm:
             with torch.no_grad():
                 residual = observations(force_model, features).residual[:, 0].numpy()
-            self._local.learn_all(visited, residual)
+            learn_log(self._local, visited, residual)
             self.samples = residual.shape[1]
 
     @property
@@ -170,7 +172,9 @@ class OnlinePredictor:
         """
         with self._lock:
             scalars = {"samples": np.array([self.samples]), "last": np.array([self._last])}
-            write_state(Path(path), self._local, self.group, scalars)
+            state = state_of(self._local, scalars)
+        # Learning waits for the copy, not for the disk.
+        write_state(Path(path), state, self._local, self.group)
 
     @classmethod
     def resume(cls, path: str | Path, model: ImpedanceModel, group: str | None = None) -> Self:

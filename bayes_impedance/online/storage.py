@@ -18,12 +18,8 @@ from bayes_impedance.sealed import DamagedFileError, read_sealed, write_sealed
 Arrays = Mapping[str, NDArray[Any]]
 
 
-def write_state(path: Path, local: LocalModel, group: str, scalars: Arrays) -> None:
-    """Write what `local` has learned of a group, and `scalars` beside it.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+def state_of(local: LocalModel, scalars: Arrays) -> dict[str, NDArray[Any]]:
+    """A copy of what `local` has learned, with `scalars` beside it."""
     codes = list(local.cells)
     arrays: dict[str, NDArray[Any]] = {f"scalar.{name}": values for name, values in scalars.items()}
     arrays["codes"] = np.array(codes, dtype=np.int64)
@@ -31,7 +27,16 @@ def write_state(path: Path, local: LocalModel, group: str, scalars: Arrays) -> N
         for name in fields:
             values = [getattr(known[code], name) for code in codes]
             arrays[f"{kind}.{name}"] = np.stack(values) if values else np.zeros(0)
-    write_sealed(path, arrays, {"model": fingerprint(local), "group": group})
+    return arrays
+
+
+def write_state(path: Path, state: Arrays, local: LocalModel, group: str) -> None:
+    """Write what `state_of` copied, of a group.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_sealed(path, state, {"model": fingerprint(local), "group": group})
 
 
 def read_state(path: Path, local: LocalModel, group: str) -> dict[str, NDArray[Any]]:

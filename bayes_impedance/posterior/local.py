@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bayes_impedance.config import LocalConfig
-from bayes_impedance.engines.local.build import build_local
+from bayes_impedance.engines.local.build import build_local, learn_log
 from bayes_impedance.engines.local.cell import Cell, whitened
 from bayes_impedance.engines.local.grid import weights_of
 from bayes_impedance.errors import ConfigurationError
@@ -75,7 +75,7 @@ def infer_local(
     )
 
 
-class _Learned(NamedTuple):
+class LearnedCell(NamedTuple):
     """A cell along one axis: inducing inputs `(B, D)`, factors L and Uᵀ, d `(B,)`.
 
     Offsets of levels: `loading` U⁻ᵀ Σ a ℓᵀ/(σ² + δ) `(B, 3)`, and their covariance `(3, 3)`.
@@ -93,10 +93,11 @@ class LocalConditioner:
     """Forces of one group, learned by local models, conditioned on for any number of targets.
 
     Raises:
-        ConfigurationError: the model is none that local models hold, a device answers its force, or the widths of cells
-            fit no grid.
+        ConfigurationError: the model is none that local models hold, a device answers its force, the widths of cells
+            fit no grid, or there are too few cells.
     """
 
+    @torch.no_grad()
     def __init__(
         self, prior: IndependentPrior, feature_map: FeatureMap, settings: LocalConfig, given: Features
     ) -> None:
@@ -109,12 +110,12 @@ class LocalConditioner:
         n = len(given.rows[0])
         inputs = np.ascontiguousarray(given.inputs[:, 0, :n].numpy())
         self.local = build_local(self.model, feature_map, settings, inputs[0])
-        self.local.learn_all(inputs, observations(self.model, given).residual[:, 0, :n].numpy())
+        learn_log(self.local, inputs, observations(self.model, given).residual[:, 0, :n].numpy())
         self.kernels = [self.model.kernel[axis, 0] for axis in range(len(inputs))]
         loading = level_loading(self.model, given.inputs, Latent.FORCE)[:, 0, :n].numpy()
         assert prior.level_variance is not None
         codes, _ = weights_of(self.local.grid, inputs[0], settings.active)
-        self.learned: dict[int, list[_Learned]] = {}
+        self.learned: dict[int, list[LearnedCell]] = {}
         for code, cell in self.local.cells.items():
             rows = np.flatnonzero((codes == code).any(axis=1))
             self.learned[code] = [
@@ -124,14 +125,14 @@ class LocalConditioner:
                 for axis in range(len(inputs))
             ]
 
-    def _learned(self, cell: Cell, axis: int, inputs: Array, loading: Array, variance: Tensor) -> _Learned:
+    def _learned(self, cell: Cell, axis: int, inputs: Array, loading: Array, variance: Tensor) -> LearnedCell:
         n = int(cell.used[axis])
         one = np.ones(len(inputs))
         a, scale = whitened(self.local.numbers, self.local.noise[axis], axis, cell, inputs, one)
         scaled = torch.from_numpy(loading * scale[:, None])
         factor = torch.from_numpy(cell.posterior[axis, :n, :n]).mT
         seen = torch.linalg.solve_triangular(factor, torch.from_numpy(a[:, :n]).mT @ scaled, upper=False)
-        return _Learned(
+        return LearnedCell(
             torch.from_numpy(np.ascontiguousarray(cell.inputs[axis, :, :n].T)),
             torch.from_numpy(cell.prior[axis, :n, :n]),
             factor,
@@ -140,6 +141,7 @@ class LocalConditioner:
             offset_covariance(scaled.mT @ scaled - seen.mT @ seen, variance),
         )
 
+    @torch.no_grad()
     def moments(self, target: Features, latents: Sequence[Latent]) -> dict[Latent, Moments]:
         """Moments of each latent at the samples of `target`, of the same group."""
         return {
@@ -173,7 +175,7 @@ class LocalConditioner:
 
     def _of_cell(
         self,
-        learned: _Learned,
+        learned: LearnedCell,
         axis: int,
         target: Features,
         rows: NDArray[np.int64],

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bayes_impedance.config import LocalConfig
 from bayes_impedance.engines.compiled.numbers import KernelNumbers
-from bayes_impedance.engines.local.grid import Grid
+from bayes_impedance.engines.local.grid import Grid, weights_of
 from bayes_impedance.engines.local.model import LocalModel
 from bayes_impedance.errors import ConfigurationError
 from bayes_impedance.features import FeatureMap
@@ -62,6 +62,22 @@ def build_local(
         width += np.broadcast_to(value, len(own)).tolist()
     grid = _grid(visited, np.array(columns), np.array(width))
     return LocalModel(numbers, noise, grid, settings, feature_map.width)
+
+
+def learn_log(local: LocalModel, inputs: Floats, residual: Floats) -> None:
+    """Teach an empty model all samples of a log, inputs `(axes, n, D)` and u − E[u] `(axes, n)` [N].
+
+    Raises:
+        ConfigurationError: they visit more cells than there may be, so that some would be left out.
+    """
+    codes, _ = weights_of(local.grid, inputs[0], local.settings.active)
+    needed = np.unique(codes[codes >= 0]).size
+    if needed > local.settings.cells:
+        raise ConfigurationError(
+            f"engine.local.cells: expected at least {needed}, which the given motion visits, got "
+            f"{local.settings.cells}; raise it, or widen cells with engine.local.width"
+        )
+    local.learn_all(inputs, residual)
 
 
 def _grid(visited: Floats, columns: NDArray[np.int64], width: Floats) -> Grid:
