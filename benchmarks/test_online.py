@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import resource
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -35,22 +36,20 @@ def predictor() -> OnlinePredictor:
     return OnlinePredictor(model.fit(draw_force(model.config, motion, seed=0)))
 
 
-def stream(count: int, begin: float) -> list[Sample]:
+def stream(count: int, begin: float) -> Iterator[Sample]:
     """Samples along the motion of training at 1 kHz, with white forces: what they teach does not matter here."""
     motion = repeated_motion(repetitions=4, duration=4.0, rate=1000.0, axes=("x", "y"))
     parts = [(trial.position, trial.velocity, trial.acceleration) for trial in motion.trials]
     position, velocity, acceleration = (np.concatenate(part) for part in zip(*parts, strict=True))
     generator = np.random.default_rng(0)
-    force = generator.standard_normal((count, 2))
-    rows = np.arange(count) % len(position)
-    return [
-        Sample(begin + 1e-3 * t, position[i], velocity[i], force[t], acceleration[i])
-        for t, i in enumerate(rows.tolist())
-    ]
+    for t in range(count):
+        i = t % len(position)
+        force = generator.standard_normal(2)
+        yield Sample(begin + 1e-3 * t, position[i], velocity[i], force, acceleration[i])
 
 
 def test_update_and_predict(predictor, figures):
-    samples = stream(TIMED + 1000, 1e3)
+    samples = list(stream(TIMED + 1000, 1e3))
     seconds: NDArray[np.float64] = np.empty((len(samples), 2))
     for i, sample in enumerate(samples):
         begin = time.perf_counter()
