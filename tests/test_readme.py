@@ -148,6 +148,45 @@ def sampled_figures() -> list[str]:
     ]
 
 
+def benchmarked_figures() -> list[str]:
+    """Of benchmarks/results.json and results/human_experiment.json, as the table has them."""
+    times = json.loads((ROOT / "benchmarks" / "results.json").read_text(encoding="utf-8"))["figures"]
+    rates = [
+        (times[name]["ess_per_cpu_second"], times[name]["ess_per_cpu_second_after_warmup"])
+        for name in (
+            "nuts_n200",
+            "nuts_n200_plain",
+            "nuts_n200_numpyro",
+            "nuts_n200_numpyro_in_our_coordinates",
+        )
+    ]
+    over_draws = times["nuts_n200_over_plain"]["ess_per_cpu_second_after_warmup_over_draws"]
+    loop, groups = (
+        times["online_update_and_predict"],
+        times["infer_64_groups_phase_over_calls_of_one_2_threads"],
+    )
+    study = figures_of("human_experiment")
+    people = study["subjects"]["unperturbed"].values()
+    twelve = study["recordings"]["twelve_folds"]
+    return [
+        f"{rates[0][0]:.1f}; {rates[0][1]:.0f} |",
+        f"{rates[1][0]:.3f}; {rates[1][1]:.3f}, plain",
+        f"{over_draws:.0f} times slower",
+        *(f"{all_of:.1f}; {after:.0f}, NumPyro" for all_of, after in rates[2:]),
+        f"{loop['median_milliseconds']:.2f} ms, {loop['p99_milliseconds']:.2f} ms",
+        f"{groups['ours_seconds']:.2f} s | {groups['theirs_seconds']:.2f} s",
+        *(
+            "; ".join(
+                ", ".join(f"{one['unseen']['axes'][axis][model]['msll']:.2f}" for axis in "xy")
+                for one in people
+            )
+            for model in ("impedance", "naive")
+        ),
+        f"{twelve['impedance']['msll']:.2f}; {twelve['impedance']['folds_won']} of 12 runs won",
+        f"{twelve['naive']['msll']:.2f}, naive GP",
+    ]
+
+
 def test_quoted_figures_are_those_of_the_results() -> None:
     names = ("core", "closed_loop", "recordings", "simulated_arm")
     core, loop, recordings, arm = (figures_of(name) for name in names)
@@ -203,7 +242,7 @@ def test_quoted_figures_are_those_of_the_results() -> None:
         pairs += [(ours["stiffness_xx"]["mean"], ours["stiffness_yy"]["mean"])]
         pairs += [(found["truth"][0], found["truth"][3])]
         quoted += [f"{xx:.0f}, {yy:.0f}" for xx, yy in pairs]
-    quoted += coupled_figures() + sampled_figures()
+    quoted += coupled_figures() + sampled_figures() + benchmarked_figures()
     plain = table.replace("−", "-").replace(" %", "%")
     for figure in quoted:
         assert figure.replace(" %", "%") in plain, figure
