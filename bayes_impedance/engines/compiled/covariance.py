@@ -51,7 +51,7 @@ def _norm(degree: int) -> float:
     return _bessel(degree, 0.0)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _value(profile: int, shape: float, s: float) -> float:
     """κ(s) of unit variance."""
     if profile == SQUARED_EXPONENTIAL:
@@ -62,7 +62,7 @@ def _value(profile: int, shape: float, s: float) -> float:
     return math.exp(-z) * _bessel(profile, z) / _norm(profile)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _derivatives(profile: int, shape: float, s: Floats, k: Floats) -> None:
     """κ and its first four derivatives with respect to s `(n,)`, into `k` `(5, n)`."""
     if profile == SQUARED_EXPONENTIAL:
@@ -88,7 +88,7 @@ def _derivatives(profile: int, shape: float, s: Floats, k: Floats) -> None:
             factor *= -twice_nu
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _forms(numbers: KernelNumbers, axis: int, inputs: Floats, x: Floats, forms: Floats) -> None:
     """s and s10, s01, s11, s20, s02, s21, s12, s22 between `inputs` `(D, n)` and `x` `(D,)`, into `forms` `(9, n)`."""
     forms[:] = 0.0
@@ -119,7 +119,7 @@ def _forms(numbers: KernelNumbers, axis: int, inputs: Floats, x: Floats, forms: 
                 s22[i] -= p * b1[i] * b2
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _tables(numbers: KernelNumbers, axis: int, inputs: Floats, x: Floats, table: Floats) -> None:
     """∂_tⁱ ∂_t'ʲ k_xd between `inputs` `(D, n)` and `x`, into `table` `(9, n)`, whose row 3 i + j it is."""
     n = inputs.shape[1]
@@ -149,7 +149,7 @@ def _tables(numbers: KernelNumbers, axis: int, inputs: Floats, x: Floats, table:
                 table[:, i] = 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _part(numbers: KernelNumbers, axis: int, part: int, inputs: Floats, x: Floats, out: Floats) -> None:
     """Covariance over ξ number `part` between `inputs` and `x`, into `out` `(n,)`."""
     out[:] = 0.0
@@ -169,18 +169,19 @@ def _part(numbers: KernelNumbers, axis: int, part: int, inputs: Floats, x: Float
             out[i] = variance * _value(profile, numbers.part_shape[axis, part], out[i])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def impedance_covariances(
     numbers: KernelNumbers, axis: int, order: int, inputs: Floats, x: Floats, out: Floats
 ) -> None:
     """Cov[w, w'] of stiffness, damping or mass, number `order`, of `inputs` `(D, n)` with `x`, into `out` `(n,)`."""
+    squared = numbers.expectation[axis, order] ** 2
     if numbers.part_columns[order, 0] == NONE:
-        out[:] = numbers.part_variance[axis, order]
-    else:
-        _part(numbers, axis, order, inputs, x, out)
+        variance = numbers.part_variance[axis, order]
+        out[:] = variance if numbers.gaussian[order] else squared * math.expm1(variance)
+        return
+    _part(numbers, axis, order, inputs, x, out)
     if numbers.gaussian[order]:
         return
-    squared = numbers.expectation[axis, order] ** 2
     for i in range(out.size):
         k = out[i]
         # eᵏ − 1; below the bound its series is exact to rounding
@@ -188,7 +189,7 @@ def impedance_covariances(
         out[i] = squared * (small if k < SMALL else math.exp(k) - 1.0)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def covariances(numbers: KernelNumbers, axis: int, inputs: Floats, x: Floats, out: Floats) -> None:
     """Cov[u(inputs[:, i]), ·] with force, x_d, ẋ_d at `x` `(D,)`, for `inputs` `(D, n)`, into `out` `(1 to 3, n)`.
 
@@ -224,7 +225,7 @@ def covariances(numbers: KernelNumbers, axis: int, inputs: Floats, x: Floats, ou
                 out[0, t] += own[t]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def variances(numbers: KernelNumbers, axis: int, x: Floats, out: Floats) -> None:
     """Prior variances of force (without noise) [N²], x_d [m²] and ẋ_d [m²/s²] at `x` `(D,)`, into `out` `(3,)`."""
     # Views, as the inputs of a cell are: what is compiled for these serves here, too.

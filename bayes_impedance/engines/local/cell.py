@@ -85,7 +85,7 @@ def empty_cell(axes: int, inducing: int, width: int) -> Cell:
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def learn(
     numbers: KernelNumbers,
     noise: Floats,
@@ -136,7 +136,7 @@ def learn(
     return used, posterior, d
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def refresh(used: Integers, sums: Sums, keep: float) -> tuple[Floats, Floats]:
     """`posterior` and `d` from the sums, after what these hold has been given the weight `keep`."""
     posterior, d = np.zeros_like(sums.gram), np.zeros_like(sums.moment)
@@ -151,7 +151,7 @@ def refresh(used: Integers, sums: Sums, keep: float) -> tuple[Floats, Floats]:
     return posterior, d
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def moments(
     numbers: KernelNumbers, cell: Cell, x: Floats, prior: Floats, mean: Floats, variance: Floats
 ) -> None:
@@ -173,7 +173,7 @@ def moments(
             variance[axis, quantity] = max(left, 0.0)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def choose(numbers: KernelNumbers, axis: int, inputs: Floats, most: int, enough: float) -> Integers:
     """Rows of `inputs` `(n, D)` to be inducing inputs: each is the one that those before explain least.
 
@@ -210,7 +210,7 @@ def choose(numbers: KernelNumbers, axis: int, inputs: Floats, most: int, enough:
     return chosen
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def place(numbers: KernelNumbers, axis: int, cell: Cell, inputs: Floats) -> None:
     """Make `inputs` `(m, D)` the inducing inputs of an axis of an empty cell."""
     own, row = np.empty(3), np.empty((1, cell.d.shape[1]))
@@ -225,7 +225,7 @@ def place(numbers: KernelNumbers, axis: int, cell: Cell, inputs: Floats) -> None
     cell.used[axis] = inputs.shape[0]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def whitened(
     numbers: KernelNumbers, noise: float, axis: int, cell: Cell, inputs: Floats, residual: Floats
 ) -> tuple[Floats, Floats]:

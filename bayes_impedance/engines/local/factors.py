@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
 def solve(lower: Floats, count: int, b: Floats) -> None:
     """b ← L⁻¹ b in place."""
     for k in range(count):
@@ -25,7 +25,7 @@ def solve(lower: Floats, count: int, b: Floats) -> None:
         b[k] = value / lower[k, k]
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def solve_transposed(upper: Floats, count: int, b: Floats) -> None:
     """b ← U⁻ᵀ b in place."""
     for k in range(count):
@@ -35,14 +35,14 @@ def solve_transposed(upper: Floats, count: int, b: Floats) -> None:
             b[i] -= value * upper[k, i]
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def rotate(upper: Floats, count: int, d: Floats, x: Floats, y: float) -> None:
     """One observation y = x·w + N(0, 1): UᵀU gains x xᵀ and Uᵀd gains x y; `x` is used up.
 
     Givens rotations of the rows of [U d] and [x y]: nothing is subtracted, so that rounding does not pile up.
     """
     for k in range(count):
-        r = math.hypot(upper[k, k], x[k])
+        r = math.sqrt(upper[k, k] * upper[k, k] + x[k] * x[k])
         c, s = upper[k, k] / r, x[k] / r
         upper[k, k] = r
         for i in range(k + 1, count):
@@ -54,7 +54,7 @@ def rotate(upper: Floats, count: int, d: Floats, x: Floats, y: float) -> None:
         y = c * y - s * value
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def factorise(matrix: Floats, count: int, upper: Floats) -> None:
     """`upper` ← U with UᵀU = I + `matrix`, in the first `count` rows and columns."""
     for k in range(count):
@@ -72,7 +72,7 @@ def factorise(matrix: Floats, count: int, upper: Floats) -> None:
                 upper[j, i] -= value * upper[k, i]
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
 def squared_norm(b: Floats, count: int) -> float:
     """Σ b_k²."""
     total = 0.0
@@ -81,7 +81,7 @@ def squared_norm(b: Floats, count: int) -> float:
     return total
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
 def inner(a: Floats, b: Floats, count: int) -> float:
     """Σ a_k b_k."""
     total = 0.0

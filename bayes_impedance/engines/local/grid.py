@@ -36,7 +36,7 @@ class Grid(NamedTuple):
         return int(np.prod(self.shape))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def nearest(grid: Grid, x: Floats, codes: Integers, weights: Floats) -> bool:
     """The nearest cells to a sample `x` `(D,)`, as many as `codes` holds, nearest first, and their weights.
 
@@ -96,7 +96,7 @@ def nearest(grid: Grid, x: Floats, codes: Integers, weights: Floats) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def weights_of(grid: Grid, inputs: Floats, active: int) -> tuple[Integers, Floats]:
     """Codes and weights of the `active` nearest cells to many samples `(n, D)`, `(n, active)` each; −1 outside."""
     codes, weights = np.full((inputs.shape[0], active), OUTSIDE), np.zeros((inputs.shape[0], active))

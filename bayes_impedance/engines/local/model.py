@@ -209,7 +209,7 @@ class LocalModel:
         return 1.0 if memory is None else float(np.exp(-samples / memory))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def mixture(weights: Floats, means: Floats, variances_: Floats) -> tuple[Floats, Floats]:
     """Mean and variance of a mixture, `(axes, 3)`, of members `(members, axes, 3)` with `weights` `(members,)`."""
     mean, variance = np.zeros(means.shape[1:]), np.zeros(means.shape[1:])
@@ -221,7 +221,7 @@ def mixture(weights: Floats, means: Floats, variances_: Floats) -> tuple[Floats,
     return mean, variance
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _prepare(
     numbers: KernelNumbers, grid: Grid, x: Floats, active: int
 ) -> tuple[Floats, Integers, Floats, bool]:
