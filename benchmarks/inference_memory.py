@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from bayes_impedance.config import load_config
+from bayes_impedance.config import Config, load_config
 from bayes_impedance.features import FeatureMap
 from bayes_impedance.model import Fit, ImpedanceModel
 from bayes_impedance.preprocessing import PreparedLog
@@ -34,11 +34,11 @@ def groups_of(samples: int, count: int, rate: float = 25.0) -> PreparedLog:
     return PreparedLog(("x", "y"), tuple(trials))
 
 
-def trained_on(log: PreparedLog) -> ImpedanceModel:
+def trained_on(log: PreparedLog, config: Config = CONFIG) -> ImpedanceModel:
     """Hyperparameters at their medians, and the log kept: what a posterior costs does not depend on more."""
-    model = build_force_model(CONFIG, FeatureMap(CONFIG, log.axes))
+    model = build_force_model(config, FeatureMap(config, log.axes))
     report = TrainingReport((), (0, 0), (0.0, 0.0), (0.0, 0.0), {}, False, log.n_samples)
-    return ImpedanceModel(CONFIG, Fit(model, log, report))
+    return ImpedanceModel(config, Fit(model, log, report))
 
 
 def problem_of(kind: str, size: int) -> tuple[ImpedanceModel, PreparedLog]:

@@ -12,12 +12,10 @@ import pytest
 import torch
 
 from bayes_impedance.config import load_config
-from bayes_impedance.features import FeatureMap
-from bayes_impedance.model import Fit, ImpedanceModel
+from bayes_impedance.model import ImpedanceModel
 from bayes_impedance.preprocessing import PreparedLog
-from bayes_impedance.priors import build_force_model
 from bayes_impedance.simulation.generative import draw_force, repeated_motion
-from bayes_impedance.training import TrainingReport
+from benchmarks.inference_memory import trained_on
 from benchmarks.paired import paired
 
 GROUPS, SAMPLES = 64, 100
@@ -34,10 +32,7 @@ def model_of(name: str) -> tuple[ImpedanceModel, PreparedLog]:
         motion = repeated_motion(1, 4.0, SAMPLES / 4.0, seed=g, group=str(g))
         trials.append(replace(draw_force(drawable, motion, seed=g).trials[0], name=str(g)))
     log = PreparedLog(("x", "y"), tuple(trials))
-    config = load_config(name)
-    report = TrainingReport((), (0, 0), (0.0, 0.0), (0.0, 0.0), {}, False, log.n_samples)
-    model = build_force_model(config, FeatureMap(config, log.axes))
-    return ImpedanceModel(config, Fit(model, log, report)), log
+    return trained_on(log, load_config(name)), log
 
 
 @pytest.mark.parametrize("threads", sorted(set(THREADS)))

@@ -51,7 +51,6 @@ class PointPredictor:
         self._alpha = factor.alpha.numpy()
         self._cholesky = np.asfortranarray(factor.cholesky.numpy())
         self._noise = float(observations.noise_variance.detach())
-        self._errors = list(self._numbers.error[: self._numbers.gaussian.size])
         noise = kernel.motion_noise
         self._motion_noise = None if noise is None else _MotionNoise(noise, self._numbers, self._inputs)
         self._loop: LoopEvidence | None = None
@@ -75,9 +74,7 @@ class PointPredictor:
             prior += self._motion_noise.variance(x)
         # On one thread, unlike a product with the inverse: waking another can cost milliseconds.
         white = dtrsv(self._cholesky, row, lower=1)
-        mean = row @ self._alpha
-        if self._errors:
-            mean += x[self._errors] @ self._numbers.expectation[0]
+        mean = self._numbers.prior_mean(x[None])[0] + row @ self._alpha
         variance = prior - float(white @ white)
         if self._loop is not None:
             with torch.no_grad():

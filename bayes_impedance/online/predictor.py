@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from bayes_impedance.engines.local.build import build_local, learn_log
-from bayes_impedance.engines.local.model import Coverage, LocalModel, Snapshot
+from bayes_impedance.engines.local.model import Coverage, Snapshot
 from bayes_impedance.errors import ConfigurationError, LogError
 from bayes_impedance.features import FeatureMap
 from bayes_impedance.model import ImpedanceModel
@@ -55,7 +55,7 @@ class PredictorSnapshot:
         inputs, means = self._inputs(sample)
         known = self._known
         moments = known.predict(inputs)
-        force = moments.mean[:, 0] + prior_force(known, inputs)
+        force = moments.mean[:, 0] + known.numbers.prior_mean(inputs)
         position, velocity = means[:, 0] + moments.mean[:, 1], means[:, 1] + moments.mean[:, 2]
         variance = moments.variance
         return Prediction(
@@ -151,7 +151,7 @@ class OnlinePredictor:
                     f"sample at {sample.time} s: expected one later than the last, at {self._last} s; leave it out, or "
                     "begin a new predictor for another recording"
                 )
-            coverage = self._local.learn(inputs, force - prior_force(self._local, inputs))
+            coverage = self._local.learn(inputs, force - self._local.numbers.prior_mean(inputs))
             self._last = time
             self.samples += coverage is Coverage.LEARNED
         return coverage
@@ -209,12 +209,3 @@ def _time(sample: Sample) -> float:
         return float(sample.time)
     except (TypeError, ValueError):
         return float("nan")
-
-
-def prior_force(known: LocalModel | Snapshot, inputs: Floats) -> Floats:
-    """E[u] = Σ_j E[w_j] ē_j at inputs `(axes, D)`, `(axes,)` [N]."""
-    numbers = known.numbers
-    if not numbers.error.size:
-        return np.zeros(inputs.shape[0])
-    orders = numbers.expectation.shape[1]
-    return np.einsum("aj,aj->a", numbers.expectation, inputs[:, numbers.error[:orders]])

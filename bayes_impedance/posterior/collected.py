@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from threading import Lock
 
 import numpy as np
+import torch
 from torch import Tensor
 
-from bayes_impedance.features import Features
+from bayes_impedance.features import Features, LogFeatures
 from bayes_impedance.kernels.impedance import Latent
+from bayes_impedance.posterior.batches import Batch, Progress, for_each
 from bayes_impedance.posterior.conditioning import Moments
 from bayes_impedance.posterior.results import Array, Marginal
 from bayes_impedance.preprocessing import PreparedLog
+
+#: Moments of each latent at some targets, `(groups, m, …)` each.
+MomentsAt = Callable[[Features], dict[Latent, Sequence[Tensor]]]
 
 
 class Collected:
@@ -58,6 +63,32 @@ class Collected:
             if latent not in self._arrays:
                 self._arrays[latent] = [np.empty((self._starts[-1], *value.shape[1:])) for value in values]
             return self._arrays[latent]
+
+
+def collect(
+    target: LogFeatures,
+    given: LogFeatures | None,
+    batches: Sequence[Batch],
+    condition: Callable[[Features | None], MomentsAt],
+    progress: Progress | None = None,
+) -> Collected:
+    """Moments at every sample of the log of `target`, batch by batch (see `for_each`).
+
+    `condition` takes the forces of a batch, of the log of `given`, or None where it has none.
+    """
+    collected = Collected(target.log)
+
+    def infer(batch: Batch) -> Iterator[int]:
+        with torch.no_grad():
+            evidence = None if given is None or not batch.given else given(batch.given, observed=True)
+            moments = condition(evidence)
+            for samples in batch.pieces:
+                piece = target(batch.target, samples=samples)
+                collected.put(piece, moments(piece), batch.target)
+                yield sum(len(rows) for rows in samples)
+
+    for_each(infer, batches, target.log.n_samples, progress)
+    return collected
 
 
 def axes_last(moments: Mapping[Latent, Moments]) -> dict[Latent, Sequence[Tensor]]:

@@ -8,17 +8,16 @@ The conditioning itself is in `posterior.independent` or, where axes are coupled
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 
 import torch
-from torch import Tensor
 
 from bayes_impedance.engines.closed_loop import ANCHORS
 from bayes_impedance.features import Features, LogFeatures
 from bayes_impedance.kernels.coupled import CoupledInteractionKernel
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, InteractionKernel, Latent
-from bayes_impedance.posterior.batches import Batch, Progress, for_each, plan
-from bayes_impedance.posterior.collected import Collected, axes_last
+from bayes_impedance.posterior.batches import Progress, plan
+from bayes_impedance.posterior.collected import Collected, MomentsAt, axes_last, collect
 from bayes_impedance.posterior.conditioning import pieces, select_groups, targets_at_once
 from bayes_impedance.posterior.coupled import CoupledConditioner, CoupledPrior
 from bayes_impedance.posterior.independent import IndependentConditioner, IndependentPrior, is_warped
@@ -79,31 +78,16 @@ def infer_log(
     latents = _latents_of(model) if latents is None else latents
     log = target.log
     conditionings = _Conditionings(model, jitter, latents)
-    collected = Collected(log)
-
-    def infer(batch: Batch) -> Iterator[int]:
-        with torch.no_grad():
-            evidence = None if given is None or not batch.given else given(batch.given, observed=True)
-            moments = conditionings.given(evidence)
-            for samples in batch.pieces:
-                piece = target(batch.target, samples=samples)
-                collected.put(piece, moments(piece), batch.target)
-                yield sum(len(rows) for rows in samples)
-
     # The anchors of an apparent mass are as many as the samples, padding counted in, where these are few.
     alike_below = 0 if target.feature_map.device is None else ANCHORS
     batches = plan(log, None if given is None else given.log, model.is_coupled, alike_below)
-    for_each(infer, batches, log.n_samples, progress)
+    collected = collect(target, given, batches, conditionings.given, progress)
     return _posterior(model, collected, latents)
 
 
 def _latents_of(model: ForceModel) -> list[Latent]:
     has_impedance = isinstance(model.kernel, (InteractionKernel, CoupledInteractionKernel))
     return list(Latent) if has_impedance else [Latent.FORCE]
-
-
-#: Moments of each latent at some targets, `(groups, m, …)` each.
-_Moments = Callable[[Features], dict[Latent, Sequence[Tensor]]]
 
 
 class _Conditionings:
@@ -115,7 +99,7 @@ class _Conditionings:
         with torch.no_grad():
             self._prior = CoupledPrior(model) if model.is_coupled else IndependentPrior(model)
 
-    def given(self, evidence: Features | None) -> _Moments:
+    def given(self, evidence: Features | None) -> MomentsAt:
         """Moments given the forces of `evidence`, or those of the prior."""
         latents = self._latents
         if isinstance(self._prior, CoupledPrior):

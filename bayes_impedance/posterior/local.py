@@ -6,7 +6,7 @@ has learned of the force. Levels that were learned are offsets, as in `posterior
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,8 +21,8 @@ from bayes_impedance.engines.local.grid import weights_of
 from bayes_impedance.errors import ConfigurationError
 from bayes_impedance.features import FeatureMap, Features, LogFeatures
 from bayes_impedance.kernels.impedance import IMPEDANCE_ORDER, Latent
-from bayes_impedance.posterior.batches import Batch, Progress, each_group, for_each
-from bayes_impedance.posterior.collected import Collected, axes_last
+from bayes_impedance.posterior.batches import Progress, each_group
+from bayes_impedance.posterior.collected import MomentsAt, axes_last, collect
 from bayes_impedance.posterior.conditioning import Moments, offset_covariance, unwarped
 from bayes_impedance.posterior.independent import (
     IndependentPrior,
@@ -54,24 +54,18 @@ def infer_local(
         ConfigurationError: see `LocalConditioner`.
     """
     latents = list(Latent) if latents is None else latents
-    log = target.log
     prior = IndependentPrior(model)
-    collected = Collected(log)
 
-    def infer(batch: Batch) -> Iterator[int]:
-        with torch.no_grad():
-            source: IndependentPrior | LocalConditioner = prior
-            if given is not None and batch.given:
-                forces = given(batch.given, observed=True)
-                source = LocalConditioner(prior, target.feature_map, settings, forces)
-            for samples in batch.pieces:
-                piece = target(batch.target, samples=samples)
-                collected.put(piece, axes_last(source.moments(piece, latents)), batch.target)
-                yield sum(len(rows) for rows in samples)
+    def condition(evidence: Features | None) -> MomentsAt:
+        source: IndependentPrior | LocalConditioner = prior
+        if evidence is not None:
+            source = LocalConditioner(prior, target.feature_map, settings, evidence)
+        return lambda piece: axes_last(source.moments(piece, latents))
 
-    for_each(infer, each_group(log, None if given is None else given.log), log.n_samples, progress)
+    batches = each_group(target.log, None if given is None else given.log)
+    collected = collect(target, given, batches, condition, progress)
     return Posterior(
-        log, {latent: collected.marginal(latent, is_warped(model, latent)) for latent in latents}
+        target.log, {latent: collected.marginal(latent, is_warped(model, latent)) for latent in latents}
     )
 
 
@@ -144,15 +138,17 @@ class LocalConditioner:
     @torch.no_grad()
     def moments(self, target: Features, latents: Sequence[Latent]) -> dict[Latent, Moments]:
         """Moments of each latent at the samples of `target`, of the same group."""
+        codes, weights = weights_of(self.local.grid, target.inputs[0, 0].numpy(), self.local.settings.active)
         return {
-            latent: self._moments(target, latent, prior)
+            latent: self._moments(target, latent, prior, codes, weights)
             for latent, prior in self.prior.at(target, latents).items()
         }
 
-    def _moments(self, target: Features, latent: Latent, prior: LatentPrior) -> Moments:
+    def _moments(
+        self, target: Features, latent: Latent, prior: LatentPrior, codes: NDArray[np.int64], weights: Array
+    ) -> Moments:
         shape = target.inputs.shape[:-1]
         prior_location, prior_variance = prior.location.expand(shape), prior.variance.expand(shape)
-        codes, weights = weights_of(self.local.grid, target.inputs[0, 0].numpy(), self.local.settings.active)
         # Σ g, Σ g mean, Σ g (variance + mean²)
         total = torch.zeros(3, *shape, dtype=prior_variance.dtype)
         for code in np.unique(codes).tolist():

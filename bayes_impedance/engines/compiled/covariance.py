@@ -21,8 +21,6 @@ from bayes_impedance.engines.compiled.numbers import (
 
 Floats = NDArray[np.float64]
 
-#: Rows that `covariances` gives: force, x_d and its time derivative.
-FORCE, DESIRED_POSITION, DESIRED_VELOCITY = range(3)
 #: Where the series of eᵏ − 1 to k⁴ errs by less than rounding does.
 SMALL = 1e-3
 
@@ -53,9 +51,7 @@ def _norm(degree: int) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _value(profile: int, shape: float, s: float) -> float:
-    """κ(s) of unit variance."""
-    if profile == SQUARED_EXPONENTIAL:
-        return math.exp(-s)
+    """κ(s) of unit variance, of a profile that is no squared exponential."""
     if profile == RATIONAL_QUADRATIC:
         return math.exp(-shape * math.log1p(s / shape))
     z = math.sqrt(max((4.0 * profile + 2.0) * s, (4.0 * profile + 2.0) * 1e-24))

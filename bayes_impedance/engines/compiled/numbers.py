@@ -63,6 +63,12 @@ class KernelNumbers(NamedTuple):
         own = self.part_variance[:, : self.gaussian.size]
         return np.where(self.gaussian, own, self.expectation**2 * np.expm1(own))
 
+    def prior_mean(self, inputs: Floats) -> Floats:
+        """E[u] = Σ_j E[w_j] ē_j at a sample, inputs `(axes, D)`, `(axes,)` [N]."""
+        if not self.error.size:
+            return np.zeros(inputs.shape[0])
+        return np.einsum("aj,aj->a", self.expectation, inputs[:, self.error[: self.gaussian.size]])
+
     @classmethod
     def of(cls, kernel: InteractionKernel, width: int) -> KernelNumbers:
         """Those of a kernel of batch shape `(axes, 1)`, or of one axis without, whose inputs have `width` columns.

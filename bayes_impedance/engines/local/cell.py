@@ -86,6 +86,14 @@ def empty_cell(axes: int, inducing: int, width: int) -> Cell:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _whiten(numbers: KernelNumbers, axis: int, cell: Cell, n: int, x: Floats, own: float, a: Floats) -> float:
+    """a(x) into `a` `(1, B)`, by the first `n` inducing inputs, and what they leave of the prior variance `own`: δ."""
+    covariances(numbers, axis, cell.inputs[axis, :, :n], x, a[:, :n])
+    solve(cell.prior[axis], n, a[0])
+    return max(own - squared_norm(a[0], n), 0.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def learn(
     numbers: KernelNumbers,
     noise: Floats,
@@ -110,9 +118,7 @@ def learn(
     a = np.empty((1, most))
     for axis in range(axes):
         n = used[axis]
-        covariances(numbers, axis, cell.inputs[axis, :, :n], x[axis], a[:, :n])
-        solve(cell.prior[axis], n, a[0])
-        left = max(own[axis] - squared_norm(a[0], n), 0.0)
+        left = _whiten(numbers, axis, cell, n, x[axis], own[axis], a)
         if n < most and left > max(novelty * noise[axis], LEAST_NOVELTY * own[axis]):
             cell.inputs[axis, :, n] = x[axis]
             cell.prior[axis, n, :n] = a[0, :n]
@@ -215,12 +221,11 @@ def place(numbers: KernelNumbers, axis: int, cell: Cell, inputs: Floats) -> None
     """Make `inputs` `(m, D)` the inducing inputs of an axis of an empty cell."""
     own, row = np.empty(3), np.empty((1, cell.d.shape[1]))
     for n in range(inputs.shape[0]):
-        covariances(numbers, axis, cell.inputs[axis, :, :n], inputs[n], row[:, :n])
-        solve(cell.prior[axis], n, row[0])
         variances(numbers, axis, inputs[n], own)
+        left = _whiten(numbers, axis, cell, n, inputs[n], own[0], row)
         cell.inputs[axis, :, n] = inputs[n]
         cell.prior[axis, n, :n] = row[0, :n]
-        cell.prior[axis, n, n] = np.sqrt(max(own[0] - squared_norm(row[0], n), LEAST_NOVELTY * own[0]))
+        cell.prior[axis, n, n] = np.sqrt(max(left, LEAST_NOVELTY * own[0]))
         cell.posterior[axis, n, n] = 1.0
     cell.used[axis] = inputs.shape[0]
 
@@ -235,10 +240,8 @@ def whitened(
     white = np.zeros((inputs.shape[0], cell.d.shape[1]))
     scaled = np.empty(inputs.shape[0])
     for t in range(inputs.shape[0]):
-        covariances(numbers, axis, cell.inputs[axis, :, :n], inputs[t], row[:, :n])
-        solve(cell.prior[axis], n, row[0])
         variances(numbers, axis, inputs[t], own)
-        scale = np.sqrt(noise + max(own[0] - squared_norm(row[0], n), 0.0))
+        scale = np.sqrt(noise + _whiten(numbers, axis, cell, n, inputs[t], own[0], row))
         white[t, :n] = row[0, :n] / scale
         scaled[t] = residual[t] / scale
     return white, scaled
