@@ -116,6 +116,7 @@ class OnlinePredictor:
         self._local = build_local(force_model, feature_map, model.config.engine.local, visited[0])
         # Which takes a minute where nothing was compiled yet: no loop must wait for it.
         self._local.compile(np.ascontiguousarray(visited[:, 0]))
+        self._now = PredictorSnapshot(self._inputs, self._local.view)
         self._lock = threading.Lock()
         self._last = -np.inf
         #: Samples that were learned, those of the training log included.
@@ -158,7 +159,7 @@ class OnlinePredictor:
 
     def predict(self, sample: Sample) -> Prediction:
         """As `PredictorSnapshot.predict`, from what is known now."""
-        return PredictorSnapshot(self._inputs, self._local.view).predict(sample)
+        return self._now.predict(sample)
 
     def snapshot(self) -> PredictorSnapshot:
         """What is known now, for another thread."""

@@ -130,10 +130,8 @@ class Taught:
         """Teach one sample `(axes, D)`, `(axes,)`."""
         numbers = self.problem.numbers
         own = np.array([own_variances(numbers, axis, x[[axis]])[0, 0] for axis in range(len(x))])
-        used, posterior, d = learn(
-            numbers, self.problem.noise, self.novelty, self.cell, self.sums, x, own, residual
-        )
-        self.cell = Cell(used, self.cell.inputs, self.cell.prior, posterior, d)
+        self.cell = self.cell.successor()
+        learn(numbers, self.problem.noise, self.novelty, self.cell, self.sums, x, own, residual)
 
     def learn_all(self, rows: Sequence[int] | None = None) -> Taught:
         """Teach samples of the problem, one by one."""

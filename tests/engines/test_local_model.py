@@ -313,6 +313,22 @@ def test_compiling_teaches_nothing(problem):
     assert not local.sums
 
 
+def test_nothing_is_left_to_compile(wide):
+    """Not for a first sample, nor where fewer cells are near than may be, nor outside, nor after a refresh."""
+    dispatchers = (model.nearest, model.learn_near, model.predict_near, model.prior_variances, model.refresh)
+    # A number of active cells that nothing else here has: its versions are not yet there.
+    local = local_of(wide, active=7, cells=9, forgetting=20.0, width={"position": 0.15, "velocity": 0.8})
+    x = np.ascontiguousarray(wide.inputs[:, 0])
+    local.compile(x)
+    before = [len(dispatcher.signatures) for dispatcher in dispatchers]
+    found = {local.view.predict(x).coverage, local.learn(x + 1e3, np.ones(2))}
+    for t in range(80):
+        x = np.ascontiguousarray(wide.inputs[:, t])
+        found |= {local.learn(x, wide.residual[:, t].copy()), local.view.predict(x).coverage}
+    assert found == set(Coverage)
+    assert [len(dispatcher.signatures) for dispatcher in dispatchers] == before
+
+
 def test_blocks_and_candidates_bound_memory_and_change_nothing(problem, monkeypatch):
     one, other = (problem.whole(LocalConfig(inducing=10, active=1)) for _ in range(2))
     one.learn_all(problem.inputs, problem.residual)

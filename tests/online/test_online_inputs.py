@@ -138,6 +138,11 @@ def test_a_field_that_is_not_finite_or_no_measurement_is_refused(reference, samp
         reference(sample._replace(**{field: bad}))
 
 
+def test_fields_whose_norm_is_large_pass(reference, sample):
+    large = sample._replace(position=[0.8e30, 0.8e30], velocity=[0.8e30, 0.8e30])
+    assert np.isfinite(reference(large)[0]).all()
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e200])
 def test_a_reference_that_is_not_finite_is_refused(reference, sample, value):
     with pytest.raises(LogError, match=r"expected a finite reference below 1e\+30, found \[\["):

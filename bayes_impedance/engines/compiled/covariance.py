@@ -186,39 +186,47 @@ def impedance_covariances(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _combined(
+    numbers: KernelNumbers, axis: int, inputs: Floats, x: Floats, table: Floats, out: Floats
+) -> None:
+    """What `covariances` gives, from the derivatives of k_xd in `table` `(9, n)`."""
+    orders = numbers.expectation.shape[1]
+    expectation = numbers.expectation[axis]
+    own = np.empty(out.shape[1])
+    out[:] = 0.0
+    for i in range(orders):
+        for row in range(1, out.shape[0]):
+            for t in range(own.size):
+                out[row, t] += expectation[i] * table[3 * i + row - 1, t]
+        for j in range(orders):
+            weight = expectation[i] * expectation[j]
+            for t in range(own.size):
+                out[0, t] += weight * table[3 * i + j, t]
+    for j in range(orders):
+        impedance_covariances(numbers, axis, j, inputs, x, own)
+        for t in range(own.size):
+            out[0, t] += own[t] * table[4 * j, t]
+        if numbers.error.size:
+            errors, error = inputs[numbers.error[j]], x[numbers.error[j]]
+            for t in range(own.size):
+                out[0, t] += own[t] * errors[t] * error
+    column = numbers.labels[1]
+    for part in range(orders, numbers.part_profile.size):
+        _part(numbers, axis, part, inputs, x, own)
+        for t in range(own.size):
+            if column == NONE or inputs[column, t] == x[column]:
+                out[0, t] += own[t]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def covariances(numbers: KernelNumbers, axis: int, inputs: Floats, x: Floats, out: Floats) -> None:
     """Cov[u(inputs[:, i]), ·] with force, x_d, ẋ_d at `x` `(D,)`, for `inputs` `(D, n)`, into `out` `(1 to 3, n)`.
 
     Force is without noise.
     """
-    n = inputs.shape[1]
-    orders = numbers.expectation.shape[1]
-    expectation = numbers.expectation[axis]
-    table, own = np.empty((9, n)), np.empty(n)
+    table = np.empty((9, inputs.shape[1]))
     _tables(numbers, axis, inputs, x, table)
-    out[:] = 0.0
-    for i in range(orders):
-        for row in range(1, out.shape[0]):
-            for t in range(n):
-                out[row, t] += expectation[i] * table[3 * i + row - 1, t]
-        for j in range(orders):
-            weight = expectation[i] * expectation[j]
-            for t in range(n):
-                out[0, t] += weight * table[3 * i + j, t]
-    for j in range(orders):
-        impedance_covariances(numbers, axis, j, inputs, x, own)
-        for t in range(n):
-            out[0, t] += own[t] * table[4 * j, t]
-        if numbers.error.size:
-            errors, error = inputs[numbers.error[j]], x[numbers.error[j]]
-            for t in range(n):
-                out[0, t] += own[t] * errors[t] * error
-    column = numbers.labels[1]
-    for part in range(orders, numbers.part_profile.size):
-        _part(numbers, axis, part, inputs, x, own)
-        for t in range(n):
-            if column == NONE or inputs[column, t] == x[column]:
-                out[0, t] += own[t]
+    _combined(numbers, axis, inputs, x, table, out)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -227,6 +235,6 @@ def variances(numbers: KernelNumbers, axis: int, x: Floats, out: Floats) -> None
     # Views, as the inputs of a cell are: what is compiled for these serves here, too.
     own = x.copy().reshape(x.size, 1)[:, :1]
     force, table = np.empty((1, 1))[:, :1], np.empty((9, 1))
-    covariances(numbers, axis, own, x, force)
     _tables(numbers, axis, own, x, table)
+    _combined(numbers, axis, own, x, table, force)
     out[0], out[1], out[2] = force[0, 0], table[0, 0], table[4, 0]

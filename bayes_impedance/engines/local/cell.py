@@ -25,7 +25,9 @@ from bayes_impedance.engines.local.factors import (
     inner,
     rotate,
     solve,
+    solve_three,
     solve_transposed,
+    solve_transposed_three,
     squared_norm,
 )
 
@@ -48,6 +50,10 @@ class Cell(NamedTuple):
     prior: Floats
     posterior: Floats
     d: Floats
+
+    def successor(self) -> Cell:
+        """One that may learn while others read this: what learning changes is its own."""
+        return Cell(self.used.copy(), self.inputs, self.prior, self.posterior.copy(), self.d.copy())
 
 
 class Sums(NamedTuple):
@@ -103,31 +109,28 @@ def learn(
     x: Floats,
     own: Floats,
     residual: Floats,
-) -> tuple[Integers, Floats, Floats]:
-    """Teach a cell one sample: its new `used`, `posterior` and `d`.
+) -> None:
+    """Teach a cell one sample in place, for which readers must not have it: see `Cell.successor`.
 
     Inputs `x` `(axes, D)`, prior variance of their force `own` `(axes,)` [N²], u − E[u] `residual` `(axes,)` [N].
-
-    What readers of the old cell see stays: new arrays come back, and `inputs` and `prior` gain rows that only the new
-    `used` reaches. `noise` σ_r² `(axes,)` [N²]. An input becomes an inducing one where the others leave more than
-    `novelty` times the noise of its variance, and there is room.
+    `noise` σ_r² `(axes,)` [N²]. An input becomes an inducing one where the others leave more than `novelty` times the
+    noise of its variance, and there is room. `inputs` and `prior`, which a cell shares with those before it, gain rows
+    that only the new `used` reaches.
     """
     axes, most = cell.d.shape
-    used = cell.used.copy()
-    posterior, d = cell.posterior.copy(), cell.d.copy()
     a = np.empty((1, most))
     for axis in range(axes):
-        n = used[axis]
+        n = cell.used[axis]
         left = _whiten(numbers, axis, cell, n, x[axis], own[axis], a)
         if n < most and left > max(novelty * noise[axis], LEAST_NOVELTY * own[axis]):
             cell.inputs[axis, :, n] = x[axis]
             cell.prior[axis, n, :n] = a[0, :n]
             cell.prior[axis, n, n] = np.sqrt(left)
-            posterior[axis, n, n] = 1.0
+            cell.posterior[axis, n, n] = 1.0
             a[0, n] = cell.prior[axis, n, n]
             left = 0.0
             n += 1
-            used[axis] = n
+            cell.used[axis] = n
         scale = np.sqrt(noise[axis] + left)
         for k in range(n):
             a[0, k] /= scale
@@ -136,10 +139,9 @@ def learn(
             sums.moment[axis, k] += a[0, k] * y
             for i in range(k, n):
                 sums.gram[axis, k, i] += a[0, k] * a[0, i]
-        rotate(posterior[axis], n, d[axis], a[0], y)
+        rotate(cell.posterior[axis], n, cell.d[axis], a[0], y)
     sums.samples[0] += 1
     sums.stale[0] += 1
-    return used, posterior, d
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -166,16 +168,17 @@ def moments(
     Into `mean` and `variance` `(axes, 3)`; `prior` `(axes, 3)` are the prior variances.
     """
     axes, most = cell.d.shape
-    a = np.empty((3, most))
+    a, explained = np.empty((3, most)), np.empty(3)
     for axis in range(axes):
         n = cell.used[axis]
         covariances(numbers, axis, cell.inputs[axis, :, :n], x[axis], a[:, :n])
+        solve_three(cell.prior[axis], n, a)
         for quantity in range(3):
-            solve(cell.prior[axis], n, a[quantity])
-            explained = squared_norm(a[quantity], n)
-            solve_transposed(cell.posterior[axis], n, a[quantity])
+            explained[quantity] = squared_norm(a[quantity], n)
+        solve_transposed_three(cell.posterior[axis], n, a)
+        for quantity in range(3):
             mean[axis, quantity] = inner(a[quantity], cell.d[axis], n)
-            left = prior[axis, quantity] - explained + squared_norm(a[quantity], n)
+            left = prior[axis, quantity] - explained[quantity] + squared_norm(a[quantity], n)
             variance[axis, quantity] = max(left, 0.0)
 
 

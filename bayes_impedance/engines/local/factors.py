@@ -35,6 +35,32 @@ def solve_transposed(upper: Floats, count: int, b: Floats) -> None:
             b[i] -= value * upper[k, i]
 
 
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
+def solve_three(lower: Floats, count: int, b: Floats) -> None:
+    """`solve` for three right-hand sides, the rows of `b` `(3, B)`: the factor is read once, in half of the time."""
+    one, two, three = b[0], b[1], b[2]
+    for k in range(count):
+        first, second, third = one[k], two[k], three[k]
+        for i in range(k):
+            first -= lower[k, i] * one[i]
+            second -= lower[k, i] * two[i]
+            third -= lower[k, i] * three[i]
+        one[k], two[k], three[k] = first / lower[k, k], second / lower[k, k], third / lower[k, k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def solve_transposed_three(upper: Floats, count: int, b: Floats) -> None:
+    """`solve_transposed` for three right-hand sides, the rows of `b` `(3, B)`."""
+    one, two, three = b[0], b[1], b[2]
+    for k in range(count):
+        first, second, third = one[k] / upper[k, k], two[k] / upper[k, k], three[k] / upper[k, k]
+        one[k], two[k], three[k] = first, second, third
+        for i in range(k + 1, count):
+            one[i] -= first * upper[k, i]
+            two[i] -= second * upper[k, i]
+            three[i] -= third * upper[k, i]
+
+
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def rotate(upper: Floats, count: int, d: Floats, x: Floats, y: float) -> None:
     """One observation y = x·w + N(0, 1): UᵀU gains x xᵀ and Uᵀd gains x y; `x` is used up.

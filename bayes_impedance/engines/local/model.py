@@ -5,30 +5,29 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import NamedTuple
+from functools import cached_property
+from typing import NamedTuple, TypeVar
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from bayes_impedance.config import LocalConfig
-from bayes_impedance.engines.compiled.covariance import variances
 from bayes_impedance.engines.compiled.numbers import KernelNumbers
 from bayes_impedance.engines.local.cell import (
     Cell,
     Sums,
     choose,
     empty_cell,
-    learn,
-    moments,
     place,
     refresh,
     whitened,
 )
 from bayes_impedance.engines.local.grid import Grid, nearest, weights_of
+from bayes_impedance.engines.local.step import learn_near, predict_near, prior_variances
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+Member = TypeVar("Member")
 
 #: Samples after which the factor of a cell is computed anew; more often where it forgets, this often in its memory.
 REFRESH, STEPS_OF_MEMORY = 1000, 20
@@ -72,17 +71,18 @@ class Snapshot:
 
     def predict(self, x: Floats) -> LocalMoments:
         """Moments at the inputs `x` `(axes, D)` of a sample: a mixture of the nearest cells, with its second moment."""
-        prior, codes, weights, inside = _prepare(self.numbers, self.grid, x, self.active)
-        near = [(weight, cell) for code, weight in zip(codes.tolist(), weights.tolist(), strict=True)
-                if (cell := self.cells.get(code)) is not None]  # fmt: skip
-        if not near:
+        codes, weights = np.empty(self.active, dtype=np.int64), np.empty(self.active)
+        inside = nearest(self.grid, x[0], codes, weights)
+        near = [self.cells.get(code) for code in codes.tolist()] if inside else []
+        cells = [cell for cell in near if cell is not None]
+        if not cells:
             coverage = Coverage.UNVISITED if inside else Coverage.OUTSIDE
+            prior = prior_variances(self.numbers, x)
             return LocalMoments(np.zeros_like(prior), prior, coverage)
-        means, variances_ = np.empty((2, len(near), *prior.shape))
-        for i, (_, cell) in enumerate(near):
-            moments(self.numbers, cell, x, prior, means[i], variances_[i])
-        weights = np.array([weight for weight, _ in near])
-        return LocalMoments(*mixture(weights, means, variances_), Coverage.LEARNED)
+        if len(cells) < self.active:
+            weights = weights[[cell is not None for cell in near]]
+        mean, variance = predict_near(self.numbers, _filled(cells, self.active), weights, x)
+        return LocalMoments(mean, variance, Coverage.LEARNED)
 
 
 @dataclass
@@ -101,7 +101,7 @@ class LocalModel:
     cells: dict[int, Cell] = field(default_factory=dict)
     sums: dict[int, Sums] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def view(self) -> Snapshot:
         """What is known at any time: its cells are those that learn."""
         return Snapshot(self.numbers, self.noise, self.grid, self.settings.active, self.cells)
@@ -117,8 +117,9 @@ class LocalModel:
         A place outside of the grid teaches nothing; nor does one whose cells were never visited, when there are
         `settings.cells` already (`UNVISITED`).
         """
-        prior, codes, _, inside = _prepare(self.numbers, self.grid, x, self.settings.active)
-        if not inside:
+        active = self.settings.active
+        codes = np.empty(active, dtype=np.int64)
+        if not nearest(self.grid, x[0], codes, np.empty(active)):
             return Coverage.OUTSIDE
         changed: dict[int, Cell] = {}
         for code in codes.tolist():
@@ -130,13 +131,15 @@ class LocalModel:
                 # Before the sample is learned, which nothing is forgotten of yet.
                 posterior, d = refresh(cell.used, sums, self._keep(int(sums.stale[0])))
                 cell = cell._replace(posterior=posterior, d=d)
-            used, posterior, d = learn(
-                self.numbers, self.noise, self.settings.novelty, cell, sums, x, prior[:, 0], residual
-            )
-            changed[code] = Cell(used, cell.inputs, cell.prior, posterior, d)
+            changed[code] = cell.successor()
+        if not changed:
+            return Coverage.UNVISITED
+        cells = _filled(list(changed.values()), active)
+        sums_ = _filled([self.sums[code] for code in changed], active)
+        learn_near(self.numbers, self.noise, self.settings.novelty, cells, sums_, len(changed), x, residual)
         # At once, so that a snapshot has a sample in all of its cells or in none.
         self.cells.update(changed)
-        return Coverage.LEARNED if changed else Coverage.UNVISITED
+        return Coverage.LEARNED
 
     def learn_all(self, inputs: Floats, residual: Floats) -> None:
         """Many samples at once, `(axes, n, D)` and `(axes, n)`, into cells that are empty before.
@@ -209,26 +212,6 @@ class LocalModel:
         return 1.0 if memory is None else float(np.exp(-samples / memory))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def mixture(weights: Floats, means: Floats, variances_: Floats) -> tuple[Floats, Floats]:
-    """Mean and variance of a mixture, `(axes, 3)`, of members `(members, axes, 3)` with `weights` `(members,)`."""
-    mean, variance = np.zeros(means.shape[1:]), np.zeros(means.shape[1:])
-    total = weights.sum()
-    for i in range(weights.size):
-        mean += weights[i] / total * means[i]
-    for i in range(weights.size):
-        variance += weights[i] / total * (variances_[i] + (means[i] - mean) ** 2)
-    return mean, variance
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _prepare(
-    numbers: KernelNumbers, grid: Grid, x: Floats, active: int
-) -> tuple[Floats, Integers, Floats, bool]:
-    """Prior variances, and nearest cells with their weights."""
-    codes, weights = np.full(active, -1), np.zeros(active)
-    inside = nearest(grid, x[0], codes, weights)
-    prior = np.empty((x.shape[0], 3))
-    for axis in range(x.shape[0]):
-        variances(numbers, axis, x[axis], prior[axis])
-    return prior, codes, weights, inside
+def _filled(members: list[Member], length: int) -> tuple[Member, ...]:
+    """As a tuple of that length, which ends with copies of the first: what is compiled for one length serves."""
+    return (*members, *members[:1] * (length - len(members)))
