@@ -20,3 +20,11 @@ def test_notebook_runs(path: Path, tmp_path: Path) -> None:
         if "image/png" in output.get("data", {})
     ]
     assert figures, "a notebook without a figure shows nothing"
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_committed_outputs_hold_neither_warnings_nor_paths(path: Path) -> None:
+    for cell in nbformat.read(path, as_version=4).cells:
+        for output in cell.get("outputs", []):
+            assert output.get("name") != "stderr", output["text"]
+            assert "site-packages" not in str(output.get("text"))
