@@ -88,15 +88,18 @@ def take_turns(
     """
     climb = Climb(density, gradient_tolerance, progress)
     point = climb(start, None, min(FIRST, max_iterations))
-    precision = _precision(density, point)
-    for _ in range(turns):
+    precision = _precision(density, point, one_sided=True)
+    for turn in range(turns):
         before = point[density.weight_count :]
         density.tilt, density.anchor = occam(density, point, precision), None
         point, moved = vary(point, precision)
         density.anchor = point
         point = climb(point, laplace.covariance(precision), max_iterations)
-        precision = _precision(density, point)
-        if max(moved, np.max(np.abs(point[density.weight_count :] - before), initial=0.0)) < settled:
+        moved = max(moved, np.max(np.abs(point[density.weight_count :] - before), initial=0.0))
+        last = moved < settled or turn == turns - 1
+        # What is known of a turn that others follow shows the way only.
+        precision = _precision(density, point, one_sided=not last)
+        if moved < settled:
             break
     else:
         climb.outcome = f"STOP: {turns} TURNS OF MODE AND EVIDENCE HAVE NOT SETTLED"
@@ -118,7 +121,7 @@ def find_weights(
     point = start
     if scale is None:
         point = climb(start, None, min(FIRST, max_iterations))
-        scale = laplace.covariance(_precision(density, point))
+        scale = laplace.covariance(_precision(density, point, one_sided=True))
     point = climb(point, scale, max_iterations)
     return _mode(density, point, _precision(density, point), climb)
 
@@ -140,9 +143,9 @@ def _mode(density: Density, point: Array, precision: Array, climb: Climb) -> Mod
     )
 
 
-def _precision(density: TiltedDensity, point: Array) -> Array:
+def _precision(density: TiltedDensity, point: Array, one_sided: bool = False) -> Array:
     # Not of the tilted density: the cost of steps away from the anchor is no knowledge.
-    return laplace.precision(lambda at: density.joint(at)[1], point, density.free)
+    return laplace.precision(lambda at: density.joint(at)[1], point, density.free, one_sided)
 
 
 class Climb:

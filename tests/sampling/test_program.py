@@ -93,7 +93,7 @@ def test_nuts_of_pyro_runs_on_it():
 @pytest.mark.parametrize("failure", ["no factor", "NaN"])
 def test_a_failed_factorisation_is_a_divergence_and_no_crash(monkeypatch, failure):
     """Of a mass above its median, in steps of NUTS."""
-    density = joint_density()
+    density, point = joint_density(), laplace().point
     likelihood = density.log_likelihood
     failed = 0
 
@@ -107,7 +107,7 @@ def test_a_failed_factorisation_is_a_divergence_and_no_crash(monkeypatch, failur
         raise NotPositiveDefiniteError("no factor")
 
     monkeypatch.setattr(density, "log_likelihood", fails)
-    values = density.values(torch.from_numpy(laplace().point))
+    values = density.values(torch.from_numpy(point))
     outside = {**values, "mass_weights": torch.ones_like(values["mass_weights"])}
     traced = poutine.trace(poutine.condition(pyro_program(density), outside)).get_trace()
     assert torch.isneginf(traced.nodes["force"]["fn"].log_factor)
