@@ -58,6 +58,8 @@ def find_start(
         vary=density.settle,
         turns=TURNS,
         settled=SETTLED,
+        # What `settle` is given stays in the coordinates in which chains move.
+        rough=False,
     )
     # No direction is known less than before any force.
     values, vectors = np.linalg.eigh(laplace.covariance(precision))
