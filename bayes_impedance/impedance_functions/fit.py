@@ -91,21 +91,18 @@ def take_turns(
     """
     climb = Climb(density, gradient_tolerance, progress)
     point = climb(start, None, min(FIRST, max_iterations))
-    precision = _precision(density, point, rough)
-    for turn in range(turns):
+    for _ in range(turns):
         before = point[density.weight_count :]
+        precision = _precision(density, point, rough)
         density.tilt, density.anchor = occam(density, point, precision), None
         point, moved = vary(point, precision)
         density.anchor = point
         point = climb(point, laplace.covariance(precision), max_iterations)
-        moved = max(moved, np.max(np.abs(point[density.weight_count :] - before), initial=0.0))
-        last = moved < settled or turn == turns - 1
-        precision = _precision(density, point, rough and not last)
-        if moved < settled:
+        if max(moved, np.max(np.abs(point[density.weight_count :] - before), initial=0.0)) < settled:
             break
     else:
         climb.outcome = f"STOP: {turns} TURNS OF MODE AND EVIDENCE HAVE NOT SETTLED"
-    return point, precision, climb
+    return point, _precision(density, point), climb
 
 
 def find_weights(

@@ -145,18 +145,19 @@ def learn(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def refresh(used: Integers, sums: Sums, keep: float) -> tuple[Floats, Floats]:
-    """`posterior` and `d` from the sums, after what these hold has been given the weight `keep`."""
-    posterior, d = np.zeros_like(sums.gram), np.zeros_like(sums.moment)
+def refresh(cell: Cell, sums: Sums, keep: float) -> None:
+    """`posterior` and `d` anew from the sums, in place, after what these hold has been given the weight `keep`.
+
+    As with `learn`, readers must not have the cell.
+    """
     if keep != 1.0:
         sums.gram[:] *= keep
         sums.moment[:] *= keep
-    for axis in range(used.size):
-        factorise(sums.gram[axis], used[axis], posterior[axis])
-        d[axis] = sums.moment[axis]
-        solve_transposed(posterior[axis], used[axis], d[axis])
+    for axis in range(cell.used.size):
+        factorise(sums.gram[axis], cell.used[axis], cell.posterior[axis])
+        cell.d[axis] = sums.moment[axis]
+        solve_transposed(cell.posterior[axis], cell.used[axis], cell.d[axis])
     sums.stale[0] = 0
-    return posterior, d
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from functools import cached_property
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -101,7 +100,7 @@ class LocalModel:
     cells: dict[int, Cell] = field(default_factory=dict)
     sums: dict[int, Sums] = field(default_factory=dict)
 
-    @cached_property
+    @property
     def view(self) -> Snapshot:
         """What is known at any time: its cells are those that learn."""
         return Snapshot(self.numbers, self.noise, self.grid, self.settings.active, self.cells)
@@ -126,12 +125,11 @@ class LocalModel:
             cell = self._visit(code, changed)
             if cell is None:
                 continue
+            changed[code] = cell.successor()
             sums = self.sums[code]
             if sums.stale[0] >= self.refresh_every:
                 # Before the sample is learned, which nothing is forgotten of yet.
-                posterior, d = refresh(cell.used, sums, self._keep(int(sums.stale[0])))
-                cell = cell._replace(posterior=posterior, d=d)
-            changed[code] = cell.successor()
+                refresh(changed[code], sums, self._keep(int(sums.stale[0])))
         if not changed:
             return Coverage.UNVISITED
         cells = _filled(list(changed.values()), active)
@@ -153,9 +151,10 @@ class LocalModel:
             rows = np.flatnonzero((codes == code).any(axis=1))
             cell = self._visit(code)
             if cell is not None:
-                self.cells[code] = self._taught(
+                self._teach(
                     cell, self.sums[code], *map(np.ascontiguousarray, (inputs[:, rows], residual[:, rows]))
                 )
+                self.cells[code] = cell
 
     def compile(self, x: Floats) -> None:
         """Compile all that a loop calls, at inputs `x` `(axes, D)` within the grid; nothing is learned."""
@@ -163,7 +162,7 @@ class LocalModel:
         scratch.learn(x, np.zeros(len(x)))
         scratch.view.predict(x)
         for code, cell in scratch.cells.items():
-            refresh(cell.used, scratch.sums[code], 1.0)
+            refresh(cell, scratch.sums[code], 1.0)
 
     @property
     def refresh_every(self) -> int:
@@ -171,7 +170,7 @@ class LocalModel:
         memory = self.settings.forgetting
         return REFRESH if memory is None else max(1, min(REFRESH, round(memory / STEPS_OF_MEMORY)))
 
-    def _taught(self, cell: Cell, sums: Sums, inputs: Floats, residual: Floats) -> Cell:
+    def _teach(self, cell: Cell, sums: Sums, inputs: Floats, residual: Floats) -> None:
         n = inputs.shape[1]
         candidates = np.unique(np.linspace(0, n - 1, min(n, CANDIDATES)).astype(int))
         for axis in range(self.noise.size):
@@ -187,8 +186,7 @@ class LocalModel:
                 sums.gram[axis] += white.T @ white
                 sums.moment[axis] += white.T @ scaled
         sums.samples[0] += n
-        posterior, d = refresh(cell.used, sums, 1.0)
-        return cell._replace(posterior=posterior, d=d)
+        refresh(cell, sums, 1.0)
 
     def _visit(self, code: int, learning: Iterable[int] = ()) -> Cell | None:
         """A cell, an empty one where it was never visited; None where there is no room beside those `learning`.
